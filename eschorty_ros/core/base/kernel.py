@@ -2,11 +2,14 @@
 
 numba's cache looks at the time and size of the file a function stands in. A kernel is also made of
 the kernels that it calls and of the constants it reads from other files, and an installer may keep
-the time of a file. So the stamp of a kernel's cache is a digest of all of these.
+the time of a file. So the stamp of a kernel's cache is a digest of all of these, which have to be
+defined above it.
 """
 
 from __future__ import annotations
 
+import builtins
+import dis
 import hashlib
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -59,6 +62,8 @@ def _digest(function: Callable[..., Any]) -> str:
     """Return a digest of the function's file and of all it uses from other files."""
     parts = [_file_digest(function.__code__.co_filename)]
     for name in sorted(set(_names(function.__code__))):
+        if name not in function.__globals__ and not hasattr(builtins, name):
+            raise NameError(f"{function.__qualname__} uses {name}; define it above")
         value: Any = function.__globals__.get(name)
         if isinstance(value, ModuleType):
             if value.__name__.startswith(__name__.partition(".")[0]):
@@ -73,7 +78,10 @@ def _digest(function: Callable[..., Any]) -> str:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    yield from code.co_names
+    """Yield the names of all globals that the code reads."""
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            yield instruction.argval
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _names(constant)

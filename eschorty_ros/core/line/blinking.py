@@ -201,24 +201,6 @@ def _add_lines(columns, half, place, blink):
     blink.lines[3] = _KEPT * blink.lines[3] + near
 
 
-@kernel(_nrt=False)
-def _laser_test(column, first, last, blink):
-    """Test whether the events of rows first..last follow the laser."""
-    vector = _vector(column, first, last, blink)
-    length2 = float(vector.x * vector.x + vector.y * vector.y)
-    n = float(vector.events)
-    square = length2 / (n * n * _UNIT * _UNIT)
-    rayleigh = n * square
-    if square > _STRENGTH_MIN**2:
-        alike = _is_alike(vector, blink)
-        follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
-        return _LaserTest(alike & follows, alike & (rayleigh > _RAYLEIGH_SURE))
-    # A line that moves while it is lit has events all the time, and a burst at both edges. What
-    # passes within a part of the period has one at most.
-    bursts = _has_bursts(column, first, last, blink)
-    return _LaserTest(bursts, bursts)
-
-
 @kernel(_nrt=True)
 def _has_bursts(column, first, last, blink):
     """Return true when many ON events are close behind a rising edge and OFF ones a falling one.
@@ -236,6 +218,24 @@ def _has_bursts(column, first, last, blink):
     expected = events * (_BURST / 2.0**32)
     off, on = _chernoff_exponent(burst[0], expected[0]), _chernoff_exponent(burst[1], expected[1])
     return min(off, on) > _BURST_MIN and off + on > _BURSTS_MIN
+
+
+@kernel(_nrt=False)
+def _laser_test(column, first, last, blink):
+    """Test whether the events of rows first..last follow the laser."""
+    vector = _vector(column, first, last, blink)
+    length2 = float(vector.x * vector.x + vector.y * vector.y)
+    n = float(vector.events)
+    square = length2 / (n * n * _UNIT * _UNIT)
+    rayleigh = n * square
+    if square > _STRENGTH_MIN**2:
+        alike = _is_alike(vector, blink)
+        follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
+        return _LaserTest(alike & follows, alike & (rayleigh > _RAYLEIGH_SURE))
+    # A line that moves while it is lit has events all the time, and a burst at both edges. What
+    # passes within a part of the period has one at most.
+    bursts = _has_bursts(column, first, last, blink)
+    return _LaserTest(bursts, bursts)
 
 
 @kernel(_nrt=False)

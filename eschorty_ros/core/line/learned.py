@@ -274,6 +274,42 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
 
 
 @kernel
+def _compute(footprint):
+    """Compute the logarithms from the counts of pixels."""
+    pixels, log, none = footprint.pixels, footprint.log, footprint.none
+    size = pixels.shape[1]
+    shares = pixels + pixels[:, ::-1]
+    if shares.sum() == 0.0:
+        return
+    overall = shares.sum(axis=1) / shares.sum()
+    for k in range(_COUNTS):
+        for _ in range(_SMOOTHING_PASSES):
+            before = shares[k].copy()
+            for b in range(size):
+                low, high = before[max(b - 1, 0)], before[min(b + 1, size - 1)]
+                shares[k, b] = 0.5 * before[b] + 0.25 * (low + high)
+        shares[k] += _PRIOR_PIXELS * overall[k] + _PRIOR_COUNT
+    least = max(_LOG_MIN, _LOG_SUM_MIN // (2 * footprint.reach + 3) + 1)
+    for b in range(size // 2 + 1):
+        total = shares[:, b].sum()
+        for k in range(_COUNTS):
+            share = max(np.rint(_LOG_ONE * np.log(shares[k, b] / total)), least)
+            if k == 0:
+                none[b] = share
+            log[k, b] = share - none[b]
+        log[:, size - 1 - b], none[size - 1 - b] = log[:, b], none[b]
+    reach, middle = footprint.reach, size // 2
+    for place in range(footprint.empty.size):
+        total = np.int64(0)
+        for row in range(-reach - 1, reach + 2):
+            at = place % _PLACES - _PLACES * row
+            if abs(at) <= _PLACES * reach:
+                total += none[middle + at]
+        footprint.empty[place] = total
+    footprint.state.computations += 1
+
+
+@kernel
 def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
@@ -337,39 +373,3 @@ def _choose(footprint, row, history, late, always):
         state.choice = LEARNED_ROWS if pays else MEAN_ROWS
         state.trying = 0
     return state.choice != UNDECIDED
-
-
-@kernel
-def _compute(footprint):
-    """Compute the logarithms from the counts of pixels."""
-    pixels, log, none = footprint.pixels, footprint.log, footprint.none
-    size = pixels.shape[1]
-    shares = pixels + pixels[:, ::-1]
-    if shares.sum() == 0.0:
-        return
-    overall = shares.sum(axis=1) / shares.sum()
-    for k in range(_COUNTS):
-        for _ in range(_SMOOTHING_PASSES):
-            before = shares[k].copy()
-            for b in range(size):
-                low, high = before[max(b - 1, 0)], before[min(b + 1, size - 1)]
-                shares[k, b] = 0.5 * before[b] + 0.25 * (low + high)
-        shares[k] += _PRIOR_PIXELS * overall[k] + _PRIOR_COUNT
-    least = max(_LOG_MIN, _LOG_SUM_MIN // (2 * footprint.reach + 3) + 1)
-    for b in range(size // 2 + 1):
-        total = shares[:, b].sum()
-        for k in range(_COUNTS):
-            share = max(np.rint(_LOG_ONE * np.log(shares[k, b] / total)), least)
-            if k == 0:
-                none[b] = share
-            log[k, b] = share - none[b]
-        log[:, size - 1 - b], none[size - 1 - b] = log[:, b], none[b]
-    reach, middle = footprint.reach, size // 2
-    for place in range(footprint.empty.size):
-        total = np.int64(0)
-        for row in range(-reach - 1, reach + 2):
-            at = place % _PLACES - _PLACES * row
-            if abs(at) <= _PLACES * reach:
-                total += none[middle + at]
-        footprint.empty[place] = total
-    footprint.state.computations += 1

@@ -208,6 +208,27 @@ def _best(errors, block):
     return best
 
 
+@kernel(_nrt=False)
+def _divide(rows, smoothing):
+    """Divide the sums of points and neighbours; return the number of averaged points.
+
+    Loops over all columns, each over a few arrays, run in vectors.
+    """
+    smoothed = 0
+    for k in range(rows.row.shape[0]):
+        own, row, used = rows.row[k], smoothing.row[k], smoothing.used[k]
+        sigma2, width = smoothing.sigma2[k], smoothing.widths.smoothed[k]
+        for c in range(np.uintp(own.size)):
+            row[c] = own[c] + row[c] / used[c]
+        for c in range(np.uintp(own.size)):
+            sigma2[c] /= used[c] * used[c]
+            smoothed += used[c] > 1.0
+        for c in range(np.uintp(own.size)):
+            near = min(used[c], WIDTH_COLUMNS)
+            width[c] = np.nan if np.isnan(own[c]) else np.sqrt(width[c] / near)
+    return smoothed
+
+
 @kernel
 def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
@@ -249,27 +270,6 @@ def _smooth(rows, smoothing):
                 smoothing.sigma2[k, c], widths.smoothed[k, c] = sums
                 smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
     return _divide(rows, smoothing)
-
-
-@kernel(_nrt=False)
-def _divide(rows, smoothing):
-    """Divide the sums of points and neighbours; return the number of averaged points.
-
-    Loops over all columns, each over a few arrays, run in vectors.
-    """
-    smoothed = 0
-    for k in range(rows.row.shape[0]):
-        own, row, used = rows.row[k], smoothing.row[k], smoothing.used[k]
-        sigma2, width = smoothing.sigma2[k], smoothing.widths.smoothed[k]
-        for c in range(np.uintp(own.size)):
-            row[c] = own[c] + row[c] / used[c]
-        for c in range(np.uintp(own.size)):
-            sigma2[c] /= used[c] * used[c]
-            smoothed += used[c] > 1.0
-        for c in range(np.uintp(own.size)):
-            near = min(used[c], WIDTH_COLUMNS)
-            width[c] = np.nan if np.isnan(own[c]) else np.sqrt(width[c] / near)
-    return smoothed
 
 
 @kernel(_nrt=False)

@@ -107,6 +107,22 @@ def _keep_widths(widths, known):
 
 
 @kernel
+def _update(widths, columns):
+    """Bring the sums and the median up to date, and halve what is remembered when it is much."""
+    number, below = widths.usual.number, widths.below
+    if below[_BINS] > _PROFILES_KEPT * columns:
+        number *= 0.5
+    total = 0.0
+    for b in range(_BINS):
+        total += number[b]
+        below[b + 1] = total
+    median = 0
+    while median < _BINS - 1 and 2.0 * below[median + 1] < total:
+        median += 1
+    widths.usual.median.width = (median + 0.5) / _PER_ROW
+
+
+@kernel
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
     usual, history = widths.usual, widths.history
@@ -137,22 +153,6 @@ def _unusual_variance(width, usual):
     if width < usual:
         return (PER_NARROWER * (usual - width)) ** 2
     return width * width - usual * usual
-
-
-@kernel
-def _update(widths, columns):
-    """Bring the sums and the median up to date, and halve what is remembered when it is much."""
-    number, below = widths.usual.number, widths.below
-    if below[_BINS] > _PROFILES_KEPT * columns:
-        number *= 0.5
-    total = 0.0
-    for b in range(_BINS):
-        total += number[b]
-        below[b + 1] = total
-    median = 0
-    while median < _BINS - 1 and 2.0 * below[median + 1] < total:
-        median += 1
-    widths.usual.median.width = (median + 0.5) / _PER_ROW
 
 
 @kernel

@@ -199,6 +199,57 @@ class StepCompensator:
 
 
 @kernel
+def _centroid_shift(before, now, after):
+    """Return the shift of the line's centroid towards the rows from which the surface comes, px.
+
+    The arguments are full widths of the lit rows on the surface before the step, across it and
+    behind it. The wider side shows ``low / 2 + half`` rows on one side of the centre, the other
+    ``low / 2``. As the step crosses, rows of the wider side first appear beyond a gap, then
+    replace dark rows, then lit ones (no change of width), and at last the narrower side's rows go.
+    """
+    low = min(before, after)
+    high = max(before, after)
+    extra = min(max(now - low, 0.0), high - low)
+    if extra == 0.0:
+        size = 0.0
+    elif 2.0 * extra <= high - low:
+        size = extra * (high - extra) / (2.0 * now)
+    else:
+        size = 0.5 * (high - low - extra)
+    return size if after >= before else -size
+
+
+@kernel
+def _interpolated(row_before, row_after, back, ahead):
+    """Return the row between two neighbours in time, or that of the only one; NaN without any."""
+    if np.isnan(row_before):
+        return row_after
+    if np.isnan(row_after):
+        return row_before
+    return (row_before * ahead + row_after * back) / (back + ahead)
+
+
+@kernel
+def _median(widths, column, lit_only, scratch):
+    """Return the median of the columns around one; with ``lit_only`` of those with a point."""
+    n = 0
+    first = max(column - _REACH_COLUMNS, 0)
+    for c in range(first, min(column + _REACH_COLUMNS + 1, widths.size)):
+        value = widths[c]
+        if value == 0.0 and lit_only:
+            continue
+        k = n
+        while k > 0 and scratch[k - 1] > value:
+            scratch[k] = scratch[k - 1]
+            k -= 1
+        scratch[k] = value
+        n += 1
+    if n == 0:
+        return 0.0
+    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
+
+
+@kernel
 def _shifts(points, history, number, newest):
     """Write the shift and the difference of each point of profile ``number``.
 
@@ -231,59 +282,8 @@ def _shifts(points, history, number, newest):
 
 
 @kernel
-def _centroid_shift(before, now, after):
-    """Return the shift of the line's centroid towards the rows from which the surface comes, px.
-
-    The arguments are full widths of the lit rows on the surface before the step, across it and
-    behind it. The wider side shows ``low / 2 + half`` rows on one side of the centre, the other
-    ``low / 2``. As the step crosses, rows of the wider side first appear beyond a gap, then
-    replace dark rows, then lit ones (no change of width), and at last the narrower side's rows go.
-    """
-    low = min(before, after)
-    high = max(before, after)
-    extra = min(max(now - low, 0.0), high - low)
-    if extra == 0.0:
-        size = 0.0
-    elif 2.0 * extra <= high - low:
-        size = extra * (high - extra) / (2.0 * now)
-    else:
-        size = 0.5 * (high - low - extra)
-    return size if after >= before else -size
-
-
-@kernel
 def _medians(widths, medians):
     """Write the median of the columns around each column; those without a point count as 0."""
     scratch = np.empty(2 * _REACH_COLUMNS + 1)
     for column in range(widths.size):
         medians[column] = _median(widths, column, False, scratch)
-
-
-@kernel
-def _median(widths, column, lit_only, scratch):
-    """Return the median of the columns around one; with ``lit_only`` of those with a point."""
-    n = 0
-    first = max(column - _REACH_COLUMNS, 0)
-    for c in range(first, min(column + _REACH_COLUMNS + 1, widths.size)):
-        value = widths[c]
-        if value == 0.0 and lit_only:
-            continue
-        k = n
-        while k > 0 and scratch[k - 1] > value:
-            scratch[k] = scratch[k - 1]
-            k -= 1
-        scratch[k] = value
-        n += 1
-    if n == 0:
-        return 0.0
-    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
-
-
-@kernel
-def _interpolated(row_before, row_after, back, ahead):
-    """Return the row between two neighbours in time, or that of the only one; NaN without any."""
-    if np.isnan(row_before):
-        return row_after
-    if np.isnan(row_after):
-        return row_before
-    return (row_before * ahead + row_after * back) / (back + ahead)

@@ -75,3 +75,21 @@ def _sum(pair):
         (tmp_path / "pairs.py").write_text(code.format(name=name))
         call = f"from pairs import _sum, {name}; print(_sum({name}(1, 2)))"
         assert output(tmp_path, "-c", call) == "3\n"
+
+
+def test_a_kernel_uses_nothing_that_is_defined_below_it(tmp_path):
+    """Its cache would not notice a change there."""
+    code = """
+from eschorty_ros.core.base.kernel import kernel
+
+@kernel
+def _total(x):
+    return _scaled(x)
+
+@kernel
+def _scaled(x):
+    return 2 * x
+"""
+    (tmp_path / "below.py").write_text(code)
+    call = "try:\n    import below\nexcept NameError as error:\n    print(error)"
+    assert output(tmp_path, "-c", call) == "_total uses _scaled; define it above\n"
