@@ -63,7 +63,7 @@ def empty_bursts(columns: int) -> Bursts:
     return Bursts(events, rows_px, np.full((blocks, 2), float(_LATE)))
 
 
-@kernel
+@kernel(_nrt=True)
 def _forget_bursts(bursts):
     bursts.events[:], bursts.rows_px[:] = 0.0, 0.0
     bursts.late[:] = _LATE

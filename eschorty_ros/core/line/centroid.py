@@ -304,10 +304,10 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
     if half <= estimator.half_max:
         line_variance = min(line_variance, estimator.line_variance)
     for c in range(columns.seeds.size):
-        _pad(packed, columns.starts[c] + np.int64(columns.counts[c, 0]))
+        _pad(packed, columns.starts[c] + np.int64(columns.counts[c]))
     for c in range(columns.seeds.size):
-        n = np.int64(columns.counts[c, 0])
-        columns.counts[c, 0] = 0
+        n = np.int64(columns.counts[c])
+        columns.counts[c] = 0
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0

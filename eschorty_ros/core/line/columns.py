@@ -19,10 +19,10 @@ _ALL_ROWS = np.empty(0, np.uint32)
 
 
 class Columns(NamedTuple):
-    """Packed events by column: ``counts[c, 0]`` of them from ``starts[c]`` on.
+    """Packed events by column: ``counts[c]`` of them from ``starts[c]`` on.
 
-    The ``counts[c, 1]`` late ones of a `PhaseGate` that keeps them follow where the ``room`` for
-    the others ends, with its padding. It grows up to ``limit``. ``seeds`` are the rows of the lines
+    Behind those of all columns are the late ones of a `PhaseGate` that keeps them. The ``room`` for
+    the events of a column grows up to ``limit``. ``seeds`` are the rows of the lines
     in the last period, fixed point; -1 for none. ``rivals`` are those of second lines that are
     nearly as strong, and ``evidence`` the events by which the first ones have been stronger, which
     have had ``events``; 0 for none. In a
@@ -47,9 +47,9 @@ class Columns(NamedTuple):
 class Bins(NamedTuple):
     """Where `_bin` puts the events of a part of the period, which begins at ``edge_us``.
 
-    Events before ``floor_us`` count as at that time. ``late_on`` and ``late_off`` are 1 where a
-    gate has ON and OFF events as late, which it keeps apart or drops. ``counts`` are those of
-    `Columns`, in one dimension.
+    Events before ``floor_us`` count as at that time. ``late_on`` and ``late_off`` are the number of
+    columns where a gate has ON and OFF events as late, which it keeps apart or drops, and 0 where
+    not.
     """
 
     packed: NDArray[np.uint32]
@@ -79,11 +79,11 @@ class Appended(NamedTuple):
 def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
     """Return ``columns`` empty columns with ``room`` for events each, and ``limit`` at most."""
     room = min(room, limit)
-    size = 2 * (room + PADDING)
+    size = room + PADDING
     return Columns(
-        packed=np.empty(columns * size, np.uint32),
-        starts=np.arange(columns) * size,
-        counts=np.zeros((columns, 2), np.uint32),
+        packed=np.empty(2 * columns * size, np.uint32),
+        starts=np.arange(2 * columns) * size,
+        counts=np.zeros(2 * columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
         rivals=np.full(columns, -1, np.int64),
         evidence=np.zeros(columns),
@@ -100,7 +100,7 @@ def wider_columns(columns: Columns) -> Columns:
     """Return the same columns with twice the room, or all that the limit allows."""
     size = columns.counts.size
     packed = columns.packed.reshape(size, -1)
-    wider = empty_columns(len(columns.counts), columns.limit, 2 * columns.room)
+    wider = empty_columns(columns.seeds.size, columns.limit, 2 * columns.room)
     wider.packed.reshape(size, -1)[:, : packed.shape[1]] = packed
     return columns._replace(packed=wider.packed, starts=wider.starts, room=wider.room)
 
@@ -115,7 +115,7 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     return empty_columns(counts.size, 0, 0)._replace(
         packed=packed,
         starts=starts,
-        counts=np.stack((counts, np.zeros_like(counts)), 1).astype(np.uint32),
+        counts=counts.astype(np.uint32),
     )
 
 
@@ -149,7 +149,7 @@ def _append_event(bins, n, t_us, column, row, polarity):
     c, r = np.uintp(column), np.uint32(row)
     dt = max(t_us, bins.floor_us) - bins.edge_us
     late = _late(bins, polarity)
-    place = np.uintp(2) * c + late
+    place = c + late
     events = bins.counts[place]
     if not _is_selected(bins, c, r, late):
         return n + np.uint64(1)
@@ -189,10 +189,11 @@ def _needs_room(columns):
 @kernel(inline="always")
 def _bins(columns, part, keeps_late, edge_us, floor_us):
     """Return the bins of a part of the period."""
+    late = np.uintp(columns.seeds.size)
     return Bins(
-        columns.packed, columns.counts.reshape(-1), np.uint32(columns.room), columns.row_first,
-        columns.row_span, columns.refused, np.uintp(part.late_on), np.uintp(part.late_off),
-        keeps_late, edge_us, floor_us,
+        columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
+        columns.row_span, columns.refused, late * np.uintp(part.late_on),
+        late * np.uintp(part.late_off), keeps_late, edge_us, floor_us,
     )  # fmt: skip
 
 
@@ -202,7 +203,7 @@ def _append(events, first, limit_us, edge_us, columns, sensor_rows, gate):
     t, x, y, p = events
     before = columns.counts.copy()
     _forget_refused(columns.refused)
-    size = np.uintp(columns.counts.shape[0])
+    size = np.uintp(columns.seeds.size)
     rows_end = np.uint32(sensor_rows)
     i = np.uintp(first)
     end = np.uintp(t.size)

@@ -124,7 +124,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
     return footprint
 
 
-@kernel
+@kernel(_nrt=True)
 def _restart_from(footprint, known):
     """Begin to learn again, with what is ``known`` of the footprint."""
     footprint.pixels[:] = 0.0
@@ -309,7 +309,7 @@ def _compute(footprint):
     footprint.state.computations += 1
 
 
-@kernel
+@kernel(_nrt=True)
 def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
@@ -349,7 +349,7 @@ def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
         state.trying = state.choice == UNDECIDED and state.computations >= _ROUNDS
 
 
-@kernel
+@kernel(_nrt=True)
 def _choose(footprint, row, history, late, always):
     """Choose between learned rows and the means ``row`` by those of some profiles with both.
 

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.columns import PADDING
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
 from eschorty_ros.core.modulation import Modulation
@@ -101,7 +100,7 @@ def _fill_rows(columns, half, gate, row):
             continue
         begin = np.uintp(columns.starts[c])
         events, total = np.int64(0), np.int64(0)
-        for i in range(begin, begin + np.uintp(columns.counts[c, 0])):
+        for i in range(begin, begin + np.uintp(columns.counts[c])):
             v = columns.packed[i]
             offset = np.int64(v & ROW_MASK) * FRACTION - seed
             if abs(offset) <= half and not _is_late(v >> TIME_SHIFT, v & POLARITY, gate):
@@ -132,13 +131,13 @@ def _usual_late(columns, gate):
     late = np.zeros(columns.seeds.size, np.int64)
     for c in range(late.size):
         begin = np.uintp(columns.starts[c])
-        for i in range(begin, begin + np.uintp(columns.counts[c, 0])):
+        for i in range(begin, begin + np.uintp(columns.counts[c])):
             v = columns.packed[i]
             late[c] += _is_late(v >> TIME_SHIFT, v & POLARITY, gate)
     return np.int64(np.median(late[columns.seeds >= 0]))
 
 
-@kernel
+@kernel(_nrt=True)
 def _learn_gate(columns, half, gate):
     """Choose the gate from the events of a profile and the lines of the last one."""
     state = gate.state
@@ -162,22 +161,21 @@ def _learn_gate(columns, half, gate):
             state.off_begin, state.off_span = choice.off_begin, choice.off_span
 
 
-@kernel
+@kernel(_nrt=True)
 def _use_late(columns, gate):
     """Append late events to the others of columns with many; return the number left out."""
     most = gate.state.late + _DEVIATIONS * np.sqrt(gate.state.late)
     left = np.int64(0)
     packed, counts = columns.packed, columns.counts
     for c in range(columns.seeds.size):
-        late = np.uintp(counts[c, 1])
-        counts[c, 1] = 0
+        kept = columns.seeds.size + c
+        late = np.uintp(counts[kept])
+        counts[kept] = 0
         if late <= most:
             left += np.int64(late)
             continue
-        begin = np.uintp(columns.starts[c])
-        end = begin + np.uintp(counts[c, 0])
-        begin += np.uintp(columns.room + PADDING)
+        begin, end = np.uintp(columns.starts[kept]), np.uintp(columns.starts[c] + counts[c])
         for i in range(late):
             packed[end + i] = packed[begin + i]
-        counts[c, 0] += np.uint32(late)
+        counts[c] += np.uint32(late)
     return left

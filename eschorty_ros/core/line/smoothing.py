@@ -160,7 +160,7 @@ def _add_errors(averages, level, errors):
             end = min((block + 1) * BLOCK_COLUMNS, columns)
             for c in range(np.uintp(block * BLOCK_COLUMNS), np.uintp(end)):
                 total += squares[c]
-            errors[level, block + _NEAR] += total
+            errors[level, block + _NEAR] = _KEPT * errors[level, block + _NEAR] + total
 
 
 @kernel(_nrt=False)
@@ -208,6 +208,15 @@ def _best(errors, block):
     return best
 
 
+@kernel(_nrt=True)
+def _begin_level(difference, used, level):
+    """Begin with the neighbours of the next smaller half width, or without any."""
+    if level > 0:
+        difference[level], used[level] = difference[level - 1], used[level - 1]
+    else:
+        difference[0], used[0] = 0.0, 1.0
+
+
 @kernel(_nrt=False)
 def _divide(rows, smoothing):
     """Divide the sums of points and neighbours; return the number of averaged points.
@@ -229,7 +238,7 @@ def _divide(rows, smoothing):
     return smoothed
 
 
-@kernel
+@kernel(_nrt=False)
 def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
@@ -243,12 +252,9 @@ def _smooth(rows, smoothing):
     widths, averages, errors = smoothing.widths, smoothing.averages, smoothing.errors
     difference, used = averages.difference, averages.used
     returns, columns = rows.row.shape
-    difference[0], used[0] = 0.0, 1.0
-    errors *= _KEPT
     added = 0
     for level in range(smoothing.half_widths.size):
-        if level > 0:
-            difference[level], used[level] = difference[level - 1], used[level - 1]
+        _begin_level(difference, used, level)
         half_width = smoothing.half_widths[level]
         for j in range(added + 1, min(half_width, (columns - 1) // 2) + 1):
             if returns == 1:

@@ -98,7 +98,7 @@ def _width_bin(width):
     return min(np.int64(width * _PER_ROW), _BINS - 1)
 
 
-@kernel
+@kernel(_nrt=True)
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles."""
     points, usual = _PROFILES_KNOWN * widths.smoothed.shape[1], widths.usual

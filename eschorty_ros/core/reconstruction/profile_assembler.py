@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import Decoder, EventArrays
@@ -31,6 +32,7 @@ from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profile_rows import (
+    Memory,
     _begin_window,
     _close,
     allocate,
@@ -115,7 +117,10 @@ class ProfileAssembler:
         self._first_choice = first_choice(settings)
         self._counters = record(*_COUNTERS)
         self._state = record(*_STATE)
-        self._memory = allocate(settings, model)
+        self._use(allocate(settings, model))
+
+    def _use(self, memory: Memory) -> None:
+        self._memory, self._boxed = memory, Boxed(memory)
 
     def restart(self, modulation: Modulation, every: int) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``.
@@ -126,11 +131,13 @@ class ProfileAssembler:
         if CENTROIDS[self._memory.estimator.method] in FULL_COLUMN_METHODS:
             # They hold background, which comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
-        self._memory = self._memory._replace(
-            gate=make_gate(modulation, self._gate_us),
-            blink=blink(modulation, every),
-            light=lit,
-            scatter=self._memory.scatter._replace(laser_edges=2 * every),
+        self._use(
+            self._memory._replace(
+                gate=make_gate(modulation, self._gate_us),
+                blink=blink(modulation, every),
+                light=lit,
+                scatter=self._memory.scatter._replace(laser_edges=2 * every),
+            )
         )
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
@@ -149,13 +156,15 @@ class ProfileAssembler:
         Nothing is counted, and no footprint learned.
         """
         memory = before._memory
-        self._memory = self._memory._replace(
-            gate=same_gate(memory.gate),
-            blink=memory.blink._replace(lines=self._memory.blink.lines),
-            light=memory.light,
-            scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
-            known=memory.known,
-            known_widths=memory.known_widths,
+        self._use(
+            self._memory._replace(
+                gate=same_gate(memory.gate),
+                blink=memory.blink._replace(lines=self._memory.blink.lines),
+                light=memory.light,
+                scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
+                known=memory.known,
+                known_widths=memory.known_widths,
+            )
         )
         self._state["known_half"] = before._state["known_half"]
         self._memory.columns.counts[:] = 0
@@ -203,7 +212,7 @@ class ProfileAssembler:
         size = held[0].size + new[0].size
         progress = _Progress(0, 0)
         while True:
-            progress = _merge(*parts, edges, progress, self._memory, self._state, self._counters)
+            progress = _merge(*parts, edges, progress, self._boxed, self._state, self._counters)
             self._widen()
             if progress.event == size and progress.edge == edges.t_us.size:
                 return
@@ -228,7 +237,7 @@ class ProfileAssembler:
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
             progress = _merge_words(
-                words, progress, decoder.memory, span, edges, self._memory, self._state,
+                words, progress, decoder.memory, span, edges, self._boxed, self._state,
                 self._counters,
             )  # fmt: skip
             full, crowded = self._widen(), self._state["rows"] > rows_max
@@ -241,7 +250,7 @@ class ProfileAssembler:
         """Give the columns more room where one is full; return whether it was so."""
         full = bool(self._state["full"])
         if full:
-            self._memory = self._memory._replace(columns=wider_columns(self._memory.columns))
+            self._use(self._memory._replace(columns=wider_columns(self._memory.columns)))
             self._state["full"] = 0
         return full
 
@@ -338,13 +347,13 @@ def _merge_part(events, edges, i, edge, drain, memory, state, counters):
 
 
 @kernel
-def _merge(held, new, edges, progress, memory, state, counters):
+def _merge(held, new, edges, progress, boxed, state, counters):
     """Merge events, first those of ``held``, with edges from ``progress`` on.
 
     A period is closed when an event reaches its end or after the last event. Events and edges
     remain when the output has no room for another profile.
     """
-    size = held.t.size
+    memory, size = boxed.content, held.t.size
     i, edge = progress
     if i < size:
         i, edge = _merge_part(held, edges, i, edge, False, memory, state, counters)
@@ -358,13 +367,17 @@ _decode_into_bins = decode_into(_bin, "bins")
 _decode_all_into_bins = decode_into(_bin_all, "all_bins")
 
 
-@kernel
-def _merge_words(words, progress, decoder, span, edges, memory, state, counters):
-    """Decode words into the open period and those that begin at the edges.
+@kernel(_nrt=False)
+def _copy(counts, numbers, other_counts, other_numbers):
+    """Copy the columns' counts and the decoder's numbers to others."""
+    for c in range(np.uintp(counts.size)):
+        other_counts[c] = counts[c]
+    for k in range(np.uintp(numbers.size)):
+        other_numbers[k] = numbers[k]
 
-    It ends before the first event at the end of ``span`` or later, and before a trigger. Words
-    and edges remain when a column or the output has no room.
-    """
+
+@kernel(_nrt=False)
+def _pass(words, progress, decoder, span, edges, memory, before, state, counters):
     columns, gate = memory.columns, memory.gate.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
@@ -373,7 +386,7 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
         # A profile may change the gate.
         takes_all = gate.step == 0 and columns.row_first.size == 0
         end_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
-        before = columns.counts.copy(), decoder.numbers.copy()
+        _copy(columns.counts, decoder.numbers, *before)
         _forget_refused(columns.refused)
         floor_us = max(state.edge_us, span.floor_us)
         part = _gate_part(max(state.part_us, floor_us), state.edge_us, gate)
@@ -384,7 +397,7 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
         else:
             end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
         if _needs_room(columns):
-            columns.counts[:], decoder.numbers[:] = before
+            _copy(*before, columns.counts, decoder.numbers)
             state.full = 1
             break
         i = end
@@ -409,3 +422,15 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
             state.over = 1
             break
     return _Progress(np.int64(i), edge)
+
+
+@kernel
+def _merge_words(words, progress, decoder, span, edges, boxed, state, counters):
+    """Decode words into the open period and those that begin at the edges.
+
+    It ends before the first event at the end of ``span`` or later, and before a trigger. Words
+    and edges remain when a column or the output has no room.
+    """
+    memory = boxed.content
+    before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
+    return _pass(words, progress, decoder, span, edges, memory, before, state, counters)

@@ -193,7 +193,7 @@ def _factor_max(settings: Settings) -> float:
     return 1.0 if settings.reflectance_compensation == "on" else FACTOR_MAX
 
 
-@kernel
+@kernel(_nrt=True)
 def _begin_window(memory, state):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
     state.window = state.profiles = 0
@@ -271,7 +271,7 @@ def _write(rows, smoothing, few, delay_us, state, output):
     state.rows = end
 
 
-@kernel
+@kernel(_nrt=False)
 def _close(memory, state, counters):
     """Turn the open period into rows."""
     columns, estimator, gate = memory.columns, memory.estimator, memory.gate

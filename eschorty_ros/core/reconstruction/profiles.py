@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from functools import cache, lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
 _DTYPES = {
@@ -52,6 +53,7 @@ class LineRows:
         return len(self.column)
 
     @classmethod
+    @cache
     def empty(cls) -> Self:
         """Return no rows."""
         names = [item.name for item in fields(cls) if item.name in _DTYPES]
@@ -93,6 +95,34 @@ class LineRows:
         return replace(self, reflectance=nothing, reflectance_sigma=nothing)
 
 
+class _Scale(NamedTuple):
+    """Constants of Eq. 2; the row offset is by column."""
+
+    offset_px: NDArray[np.float64]
+    product_mm_px: float
+    b_mm: float
+
+
+@lru_cache(maxsize=8)
+def _scale(model: RangeModel) -> _Scale:
+    offset_px = np.array(model.row_offset_px(np.arange(model.columns)))
+    return _Scale(offset_px, model.product_mm_px, float(model.b_mm))
+
+
+@kernel
+def _fill_ranges(row, sigma_row, column, scale, range_mm, sigma_mm):
+    """Set ranges and deviations as `RangeModel` has them, in one pass; return how many are NaN."""
+    beyond = 0
+    for i in range(np.uintp(row.size)):
+        image_px = row[i] + scale.offset_px[column[i]]
+        known = image_px <= -POLE_MARGIN_PX
+        image_px = image_px if known else np.nan
+        range_mm[i] = scale.product_mm_px / image_px - scale.b_mm
+        sigma_mm[i] = -scale.product_mm_px / (image_px * image_px) * sigma_row[i]
+        beyond += not known
+    return beyond
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Profiles(LineRows):
     """Points of complete profiles as arrays of equal length, by period, column and return index.
@@ -130,12 +160,10 @@ class Profiles(LineRows):
     @classmethod
     def from_rows(cls, rows: LineRows, model: RangeModel) -> Profiles:
         """Return ``rows`` with their ranges; those at the pole and behind it are left out."""
-        bent = model.b_prime_1_px != 0.0 or model.b_prime_2_px != 0.0
-        range_mm = model.range_mm(rows.row, rows.column if bent else None)
-        known = np.isfinite(range_mm)
-        if not known.all():
-            rows, range_mm = rows.select(known), range_mm[known]
-        sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column if bent else None)
+        range_mm, sigma_mm = np.empty((2, len(rows)))
+        if _fill_ranges(rows.row, rows.sigma_row, rows.column, _scale(model), range_mm, sigma_mm):
+            known = np.isfinite(range_mm)
+            rows, range_mm, sigma_mm = rows.select(known), range_mm[known], sigma_mm[known]
         return cls(**rows._values(), range_mm=range_mm, sigma_mm=sigma_mm)
 
     @property

@@ -1,0 +1,37 @@
+"""Many arrays as one argument of a compiled function.
+
+At every call numba takes a tuple of arrays apart, which costs as much as a packet's events where
+there are a hundred of them. Boxed arrays are taken apart once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.experimental import structref
+
+from eschorty_ros.core.base.kernel import kernel
+
+
+@structref.register
+class _BoxedType(types.StructRef):
+    """Type of `Boxed` in compiled functions."""
+
+
+class Boxed(structref.StructRefProxy):
+    """A named tuple, whose fields a compiled function reads from ``content``."""
+
+    def __new__(cls, content: Any) -> Boxed:
+        """Return ``content`` boxed."""
+        boxed: Boxed = _boxed(content)
+        return boxed
+
+
+structref.define_boxing(_BoxedType, Boxed)
+structref.define_constructor(Boxed, _BoxedType, ["content"])
+
+
+@kernel
+def _boxed(content):
+    return Boxed(content)
