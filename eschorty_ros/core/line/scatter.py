@@ -98,7 +98,7 @@ def _forget_scatter(scatter):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
+def _add_differences(row, sigma2, variance, averaged, edge_px, sums, measures_lengths):
     """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
 
     Differences above ``edge_px`` are left out: edges of the surface, but where most are as large.
@@ -123,12 +123,13 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
                 shared = max(1.0 - apart / averaged[c], 0.0)
                 outer = sigma2[before] + sigma2[after]
                 expected += (1.0 - 4.0 / 3.0 * shared) * (outer + 4.0 * sigma2[c])
-                sizes += abs(difference)
-                # The square of a length is 12 variances of evenly lit rows.
-                wider = variance[before] - 2.0 * variance[c] + variance[after]
-                length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
-                lengths2 += min(length2, _LENGTH2_MAX) / 6.0
                 number += 1.0
+                if measures_lengths:
+                    sizes += abs(difference)
+                    # The square of a length is 12 variances of evenly lit rows.
+                    wider = variance[before] - 2.0 * variance[c] + variance[after]
+                    length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
+                    lengths2 += min(length2, _LENGTH2_MAX) / 6.0
         sums.squares[block] = _KEPT * sums.squares[block] + squares
         sums.expected[block] = _KEPT * sums.expected[block] + expected
         sums.sizes[block] = _KEPT * sums.sizes[block] + sizes
@@ -193,7 +194,7 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums)
+    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums, True)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
@@ -221,7 +222,7 @@ def _scale_smoothed(rows, scatter, smoothing):
     returns, columns = rows.row.shape
     sums, sigma2 = scatter.smoothed, smoothing.sigma2
     _add_differences(
-        smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], _EDGE_PX, sums
+        smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], _EDGE_PX, sums, False
     )
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
