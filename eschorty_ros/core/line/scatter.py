@@ -194,7 +194,9 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums, True)
+    _add_differences(
+        rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums, True
+    )
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0

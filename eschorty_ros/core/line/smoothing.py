@@ -151,6 +151,8 @@ def _add_errors(averages, level, errors):
     """Add the squared errors with which the neighbours of each point predict it, by block."""
     difference, used, squares = averages.difference, averages.used, averages.squares
     _, returns, columns = used.shape
+    for i in range(errors.shape[1]):
+        errors[level, i] *= _KEPT
     for k in range(returns):
         for c in range(columns):
             error = difference[level, k, c] / max(used[level, k, c] - 1.0, 1.0)
@@ -160,7 +162,7 @@ def _add_errors(averages, level, errors):
             end = min((block + 1) * BLOCK_COLUMNS, columns)
             for c in range(np.uintp(block * BLOCK_COLUMNS), np.uintp(end)):
                 total += squares[c]
-            errors[level, block + _NEAR] = _KEPT * errors[level, block + _NEAR] + total
+            errors[level, block + _NEAR] += total
 
 
 @kernel(_nrt=False)
