@@ -32,6 +32,10 @@ from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profile_rows import (
+    CLOSED,
+    COUNTERS,
+    EMPTY,
+    FILLED,
     Memory,
     _begin_window,
     _close,
@@ -40,37 +44,6 @@ from eschorty_ros.core.reconstruction.profile_rows import (
 )
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
-
-_COUNTERS = (
-    "events_binned",
-    "events_before_first_edge",
-    "events_outside_sensor",
-    "events_outside_roi",
-    "events_over_column_limit",
-    "events_gated",
-    "periods_closed",
-    "periods_empty",
-    "profiles_too_wide",
-    "columns_too_few_events",
-    "columns_ambiguous",
-    "columns_isolated",
-    "columns_smoothed",
-    "columns_two_returns",
-    "columns_unmodulated",
-    "events_unmodulated",
-    "points_burst_shift",
-)
-# ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
-# half width of a window for the open period in fixed point, ``rows`` the number of rows in the
-# output, ``full`` 1 while a column needs more room, ``window`` and ``profiles`` the numbers of
-# events and profiles since the estimate started, ``over`` 1 where a pass ended with it. ``points``
-# are those since the restart, ``points_most`` the most of a profile, ``known_half`` is 0 until
-# windows begin with what is known.
-_STATE = (
-    "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "profiles", "over",
-    "points", "points_most", "known_half",
-)  # fmt: skip
-_CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
 
 class Edges(NamedTuple):
@@ -115,12 +88,10 @@ class ProfileAssembler:
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
         self._first_choice = first_choice(settings)
-        self._counters = record(*_COUNTERS)
-        self._state = record(*_STATE)
         self._use(allocate(settings, model))
 
     def _use(self, memory: Memory) -> None:
-        self._memory, self._boxed = memory, Boxed(memory)
+        self._memory, self._boxed, self._state = memory, Boxed(memory), memory.state
 
     def restart(self, modulation: Modulation, every: int) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``.
@@ -139,7 +110,7 @@ class ProfileAssembler:
                 scatter=self._memory.scatter._replace(laser_edges=2 * every),
             )
         )
-        self._state["status"] = _CLOSED
+        self._state["status"] = CLOSED
         self._memory.columns.counts[:] = 0
         known = self._memory.known.state
         known["choice"] = self._first_choice
@@ -148,7 +119,7 @@ class ProfileAssembler:
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
         self._memory.known_widths.number[:] = 0.0
         self._memory.known_widths.median["difference"] = 0.0
-        _begin_window(self._memory, self._state)
+        _begin_window(self._memory)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
         """Begin a window, and its first period at an edge, with the settings of ``before``.
@@ -164,16 +135,16 @@ class ProfileAssembler:
                 scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
                 known=memory.known,
                 known_widths=memory.known_widths,
+                counters=record(*COUNTERS),
             )
         )
-        self._state["known_half"] = before._state["known_half"]
+        self._state["known_half"] = before._memory.state["known_half"]
         self._memory.columns.counts[:] = 0
-        self._counters = record(*_COUNTERS)
         self._state["rows"] = 0
         self._done = []
         self._memory.footprint.state["near_edge"] = 0
-        _begin_window(self._memory, self._state)
-        self._state["status"] = _EMPTY
+        _begin_window(self._memory)
+        self._state["status"] = EMPTY
         self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
         self._state["period"] = edges.period[edge]
 
@@ -200,7 +171,7 @@ class ProfileAssembler:
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
-        return dict(zip(_COUNTERS, self._counters.item(), strict=True))
+        return dict(zip(COUNTERS, self._memory.counters.item(), strict=True))
 
     def merge(self, held: Arrays, new: Arrays, edges: Edges) -> None:
         """Assign events to periods and close the periods whose end is reached.
@@ -212,7 +183,7 @@ class ProfileAssembler:
         size = held[0].size + new[0].size
         progress = _Progress(0, 0)
         while True:
-            progress = _merge(*parts, edges, progress, self._boxed, self._state, self._counters)
+            progress = _merge(*parts, edges, progress, self._boxed)
             self._widen()
             if progress.event == size and progress.edge == edges.t_us.size:
                 return
@@ -221,7 +192,7 @@ class ProfileAssembler:
     @property
     def has_begun(self) -> bool:
         """Return whether a period is open."""
-        return bool(self._state["status"] != _CLOSED)
+        return bool(self._state["status"] != CLOSED)
 
     def merge_words(
         self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
@@ -236,10 +207,7 @@ class ProfileAssembler:
         progress = _Progress(0, 0)
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
-            progress = _merge_words(
-                words, progress, decoder.memory, span, edges, self._boxed, self._state,
-                self._counters,
-            )  # fmt: skip
+            progress = _merge_words(words, progress, decoder.memory, span, edges, self._boxed)
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
                 self._collect()
@@ -256,7 +224,7 @@ class ProfileAssembler:
 
     def close(self) -> None:
         """Close the open period if it has events; it stays open for further ones."""
-        if self._state["status"] == _FILLED:
+        if self._state["status"] == FILLED:
             none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
             self.merge(none, none, again)
@@ -279,8 +247,9 @@ class ProfileAssembler:
 
 
 @kernel
-def _count(events, outside, refused, state, counters):
+def _count(events, outside, refused, memory):
     """Count the events read of the open period."""
+    state, counters = memory.state, memory.counters
     state.window += events
     refusals = outside + refused.over_limit + refused.outside_region + refused.gated
     counters.events_binned += events - refusals
@@ -291,63 +260,65 @@ def _count(events, outside, refused, state, counters):
 
 
 @kernel
-def _fill(events, first, limit_us, memory, state, counters):
+def _fill(events, first, limit_us, memory):
     """Sort the events before ``limit_us`` into the open period; return the index of the next."""
-    if state.status == _CLOSED:
+    state = memory.state
+    if state.status == CLOSED:
         i = first
         while i < events.t.size and events.t[i] < limit_us:
             i += 1
-        counters.events_before_first_edge += i - first
+        memory.counters.events_before_first_edge += i - first
         return i
-    state.status = _FILLED
+    state.status = FILLED
     columns, gate = memory.columns, memory.gate.state
     sensor_rows = memory.estimator.sensor_rows
     appended = _append(events, first, limit_us, state.edge_us, columns, sensor_rows, gate)
     state.full = appended.full
     if not appended.full:
-        _count(appended.next - first, appended.outside, columns.refused, state, counters)
+        _count(appended.next - first, appended.outside, columns.refused, memory)
     return appended.next
 
 
 @kernel(inline="always")
-def _begin_period(edges, edge, memory, state, counters):
+def _begin_period(edges, edge, memory):
     """Close the open period and begin the next at an edge."""
-    if state.status == _FILLED:
-        _close(memory, state, counters)
-    elif state.status == _EMPTY:
-        counters.periods_empty += 1
-    state.status = _EMPTY
+    state = memory.state
+    if state.status == FILLED:
+        _close(memory)
+    elif state.status == EMPTY:
+        memory.counters.periods_empty += 1
+    state.status = EMPTY
     state.edge_us = state.part_us = edges.t_us[edge]
     state.period = edges.period[edge]
 
 
 @kernel(inline="always")
-def _merge_part(events, edges, i, edge, drain, memory, state, counters):
+def _merge_part(events, edges, i, edge, drain, memory):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
-    rows_max = memory.output.row.size - memory.rows.row.size
+    state, rows_max = memory.state, memory.output.row.size - memory.rows.row.size
     t, edges_us = events.t, edges.t_us
     far = np.int64(1 << 62)
     while True:
         limit_us = edges_us[edge] if edge < edges_us.size else far
         if i < t.size and t[i] < limit_us:
-            i = _fill(events, i, limit_us, memory, state, counters)
+            i = _fill(events, i, limit_us, memory)
             if state.full:
                 return i, edge
         if edge == edges_us.size or (i == t.size and not drain):
             return i, edge
-        if state.status == _FILLED and state.rows > rows_max:
+        if state.status == FILLED and state.rows > rows_max:
             return i, edge
         # In the dark many periods end at once.
         first, next_us = edge, t[i] if i < t.size else far
         while edge + 1 < edges_us.size and edges_us[edge + 1] <= next_us:
             edge += 1
-        _begin_period(edges, edge, memory, state, counters)
-        counters.periods_empty += edge - first
+        _begin_period(edges, edge, memory)
+        memory.counters.periods_empty += edge - first
         edge += 1
 
 
 @kernel
-def _merge(held, new, edges, progress, boxed, state, counters):
+def _merge(held, new, edges, progress, boxed):
     """Merge events, first those of ``held``, with edges from ``progress`` on.
 
     A period is closed when an event reaches its end or after the last event. Events and edges
@@ -356,10 +327,10 @@ def _merge(held, new, edges, progress, boxed, state, counters):
     memory, size = boxed.content, held.t.size
     i, edge = progress
     if i < size:
-        i, edge = _merge_part(held, edges, i, edge, False, memory, state, counters)
+        i, edge = _merge_part(held, edges, i, edge, False, memory)
         if i < size:
             return _Progress(i, edge)
-    i, edge = _merge_part(new, edges, i - size, edge, True, memory, state, counters)
+    i, edge = _merge_part(new, edges, i - size, edge, True, memory)
     return _Progress(size + i, edge)
 
 
@@ -377,8 +348,9 @@ def _copy(counts, numbers, other_counts, other_numbers):
 
 
 @kernel(_nrt=False)
-def _pass(words, progress, decoder, span, edges, memory, before, state, counters):
-    columns, gate = memory.columns, memory.gate.state
+def _pass(words, progress, decoder, span, edges, memory, before):
+    """Do the work of `_merge_words`; ``before`` has room for what a full column undoes."""
+    columns, gate, state = memory.columns, memory.gate.state, memory.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
     state.over = 0
@@ -402,8 +374,8 @@ def _pass(words, progress, decoder, span, edges, memory, before, state, counters
             break
         i = end
         if events > 0:
-            state.status = _FILLED
-            _count(np.int64(events), 0, columns.refused, state, counters)
+            state.status = FILLED
+            _count(np.int64(events), 0, columns.refused, memory)
         if i == np.uint64(words.size) or words[i] >> 12 == EXT_TRIGGER:
             break
         if limit_us < end_us:
@@ -411,11 +383,11 @@ def _pass(words, progress, decoder, span, edges, memory, before, state, counters
             continue
         if edge == edges.t_us.size:
             break
-        if state.status == _FILLED and state.rows > rows_max:
+        if state.status == FILLED and state.rows > rows_max:
             break
-        filled = state.status == _FILLED
+        filled = state.status == FILLED
         learning = state.known_half == 0
-        _begin_period(edges, edge, memory, state, counters)
+        _begin_period(edges, edge, memory)
         edge += 1
         learned = learning and state.known_half > 0
         if span.one_window and filled and (learned or state.window == 0):
@@ -425,7 +397,7 @@ def _pass(words, progress, decoder, span, edges, memory, before, state, counters
 
 
 @kernel
-def _merge_words(words, progress, decoder, span, edges, boxed, state, counters):
+def _merge_words(words, progress, decoder, span, edges, boxed):
     """Decode words into the open period and those that begin at the edges.
 
     It ends before the first event at the end of ``span`` or later, and before a trigger. Words
@@ -433,4 +405,4 @@ def _merge_words(words, progress, decoder, span, edges, boxed, state, counters):
     """
     memory = boxed.content
     before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
-    return _pass(words, progress, decoder, span, edges, memory, before, state, counters)
+    return _pass(words, progress, decoder, span, edges, memory, before)

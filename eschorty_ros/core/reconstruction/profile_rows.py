@@ -95,6 +95,38 @@ _WIDER = 4
 _FILLED = np.sqrt(HALF_PER_SIGMA / FRACTION / np.sqrt(3.0))
 
 
+COUNTERS = (
+    "events_binned",
+    "events_before_first_edge",
+    "events_outside_sensor",
+    "events_outside_roi",
+    "events_over_column_limit",
+    "events_gated",
+    "periods_closed",
+    "periods_empty",
+    "profiles_too_wide",
+    "columns_too_few_events",
+    "columns_ambiguous",
+    "columns_isolated",
+    "columns_smoothed",
+    "columns_two_returns",
+    "columns_unmodulated",
+    "events_unmodulated",
+    "points_burst_shift",
+)
+CLOSED, EMPTY, FILLED = 0, 1, 2
+"""Status of the open period: there is none, it has no events, it has some."""
+# ``part_us`` is where the part of the gate begins, ``half`` the half width of a window for the open
+# period in fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs
+# more room, ``window`` and ``profiles`` the numbers of events and profiles since the estimate
+# started, ``over`` 1 where a pass ended with it. ``points`` are those since the restart,
+# ``points_most`` the most of a profile, ``known_half`` is 0 until windows begin with what is known.
+_STATE = (
+    "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "profiles", "over",
+    "points", "points_most", "known_half",
+)  # fmt: skip
+
+
 class _Output(NamedTuple):
     """Rows of closed periods as in `LineRows`; arrays of equal length."""
 
@@ -111,7 +143,7 @@ class _Output(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Settings and memory of the pass from events to rows."""
+    """Settings and memory of the pass from events to rows, its state and what it counts."""
 
     columns: Columns
     estimator: Estimator
@@ -129,6 +161,8 @@ class Memory(NamedTuple):
     row_counts: NDArray[np.int64]
     output: _Output
     window_events: int
+    state: Any
+    counters: Any
 
 
 def allocate(settings: Settings, model: RangeModel) -> Memory:
@@ -176,6 +210,8 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         row_counts=make_row_counts(),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
         window_events=WINDOW_EVENTS,
+        state=record(*_STATE),
+        counters=record(*COUNTERS),
     )
 
 
@@ -194,8 +230,9 @@ def _factor_max(settings: Settings) -> float:
 
 
 @kernel(_nrt=True)
-def _begin_window(memory, state):
+def _begin_window(memory):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
+    state = memory.state
     state.window = state.profiles = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
@@ -272,8 +309,9 @@ def _write(rows, smoothing, few, delay_us, state, output):
 
 
 @kernel(_nrt=False)
-def _close(memory, state, counters):
+def _close(memory):
     """Turn the open period into rows."""
+    state, counters = memory.state, memory.counters
     columns, estimator, gate = memory.columns, memory.estimator, memory.gate
     blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
     smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
@@ -337,4 +375,4 @@ def _close(memory, state, counters):
     state.points += points
     state.points_most = max(state.points_most, points)
     if late and state.known_half > 0:
-        _begin_window(memory, state)
+        _begin_window(memory)
