@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import byte_view, integer
+from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.kernel import record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.counters import COUNTS, Counters
@@ -60,10 +61,12 @@ class Decoder:
         self._numbers = np.zeros(len(_STATE) + len(COUNTS), np.int64)
         self._state = record(*_STATE, numbers=self._numbers[: len(_STATE)])
         self._counts = record(*COUNTS, numbers=self._numbers[len(_STATE) :])
-        self._memory = DecoderMemory(
-            self.width, self.height, self._state, self._counts, self._numbers, _trigger_arrays(0)
-        )
+        state = self._state, self._counts, self._numbers
+        self._use(DecoderMemory(self.width, self.height, *state, _trigger_arrays(0)))
         self.reset()
+
+    def _use(self, memory: DecoderMemory) -> None:
+        self._memory, self._boxed = memory, Boxed(memory)
 
     def reset(self) -> None:
         """Drop state and counters."""
@@ -138,7 +141,7 @@ class Decoder:
         if len(self._events.t) < events:
             self._events = event_arrays(events)
         if len(self._memory.triggers.t) < triggers:
-            self._memory = self._memory._replace(triggers=_trigger_arrays(triggers))
+            self._use(self._memory._replace(triggers=_trigger_arrays(triggers)))
         n, m = _decode_events(words, self._memory, self._events)
         t, x, y, p = self._events
         trigger_t, channel, edge = self._memory.triggers
@@ -162,6 +165,11 @@ class Decoder:
     def memory(self) -> DecoderMemory:
         """State and counters, for a kernel that `decode_into` returns."""
         return self._memory
+
+    @property
+    def boxed(self) -> Boxed:
+        """The memory as one argument."""
+        return self._boxed
 
     def words(self, data: Bytes) -> NDArray[np.uint16]:
         """Return the words of the carried byte and ``data``; an odd last byte is carried on."""

@@ -207,7 +207,7 @@ class ProfileAssembler:
         progress = _Progress(0, 0)
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
-            progress = _merge_words(words, progress, decoder.memory, span, edges, self._boxed)
+            progress = _merge_words(words, progress, decoder.boxed, span, edges, self._boxed)
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
                 self._collect()
@@ -397,12 +397,12 @@ def _pass(words, progress, decoder, span, edges, memory, before):
 
 
 @kernel
-def _merge_words(words, progress, decoder, span, edges, boxed):
+def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     """Decode words into the open period and those that begin at the edges.
 
     It ends before the first event at the end of ``span`` or later, and before a trigger. Words
     and edges remain when a column or the output has no room.
     """
-    memory = boxed.content
+    memory, decoder = boxed.content, boxed_decoder.content
     before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
     return _pass(words, progress, decoder, span, edges, memory, before)
