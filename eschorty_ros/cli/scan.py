@@ -14,6 +14,7 @@ from eschorty_ros.cli.files import IN_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, sweep_options
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
 if TYPE_CHECKING:
     from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--passes",
-    type=click.IntRange(1, 255),
+    type=click.IntRange(1, PASSES_MAX),
     default=1,
     show_default=True,
     help="Sweeps, every second one back; their points are joined.",

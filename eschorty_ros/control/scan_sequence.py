@@ -11,16 +11,13 @@ from typing import Protocol
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+from eschorty_ros.live.sweep_coverage import COMPLETE, PASSES_MAX
 
-# The periods at the ends of a sweep may be cut.
-_COMPLETE = 0.98
 _FAILED_DRAIN_S = 5.0
 # Longest time for the end of a scan per second of its sweep, on a computer that falls behind.
 _DRAIN_PER_S = 200.0
 SPEED_MIN_MM_S = 0.05
 """Least speed of a scan or move: between two statuses a slower stage seems to rest."""
-PASSES_MAX = 255
-"""Most passes of a scan, as the action's goal can state them."""
 
 
 class ScanFailure(EschortyError):  # noqa: N818 - reported like the other failures
@@ -94,7 +91,7 @@ class ScanSummary:
         """Return ``complete``, ``partial`` or ``failed``: without any point."""
         if not self.points:
             return "failed"
-        lossless = self.completeness >= _COMPLETE and not self.packets_lost
+        lossless = self.completeness >= COMPLETE and not self.packets_lost
         return "complete" if lossless else "partial"
 
     @property

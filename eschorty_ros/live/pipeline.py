@@ -28,10 +28,8 @@ from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffe
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.live.stage_placement import StagePlacer
-from eschorty_ros.live.sweep_coverage import SweepCoverage
+from eschorty_ros.live.sweep_coverage import COMPLETE, SweepCoverage
 
-# At the ends of a sweep a period may be cut.
-_FEW = 0.98
 # Packets wait for the camera's clock and for the worker; a recording begins with one of these.
 _STAGE_BEFORE_US = 10_000_000
 
@@ -75,7 +73,7 @@ class ScanReport:
             notes.append(self._cause_of_empty())
         if self.packets_lost:
             notes.append(f"{self.packets_lost} packets were lost")
-        if 0 < self.scan.profiles < _FEW * self.profiles_expected:
+        if 0 < self.scan.profiles < COMPLETE * self.profiles_expected:
             notes.append(
                 f"{self.scan.profiles} profiles of {self.profiles_expected} between start and "
                 f"stop; {self.points_outside} points are outside"

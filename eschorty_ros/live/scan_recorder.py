@@ -6,7 +6,7 @@ import contextlib
 import threading
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +22,13 @@ from eschorty_ros.core.reconstruction import Reconstructor
 from eschorty_ros.core.storage import Points, ScanLog
 from eschorty_ros.core.storage.recording import STAGE_DTYPE
 from eschorty_ros.core.storage.recording_writer import RecordingWriter, make_recording_folder
+from eschorty_ros.live.job_queue import Job
 from eschorty_ros.live.packet_times import GAP_NS, WRAP_US, Packet
 from eschorty_ros.live.sensor_epoch import SensorEpoch
 
 QUEUE_BYTES = 256 << 20
 """Memory of the packets that wait for the disk: seconds of the camera's highest rate."""
 _OTHER_STREAM = "camera, modulation or settings were changed during the scan"
-
-Job = Callable[[], None]
 
 
 class ScanRecorder:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+PASSES_MAX = 255
+"""Most passes of a scan, as the action's goal can state them."""
+COMPLETE = 0.98
+"""Share of the profiles from which a scan is complete: at its ends a period may be cut."""
+
 
 class SweepCoverage:
     """Adds up the stage's motion between two positions.

@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.numbers import integer, number
+from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
 ABANDONED_S = 5.0
 _CODE_BYTES = 4
 _TRIES = 5
-PASSES_MAX = 255
-"""As the action's goal can state them."""
 
 
 class ScanValues(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import estimate
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -34,8 +34,6 @@ SETTLING = 2
 FULL_WELL, GREY_LEVELS = 10_000.0, 256
 """Electrons of the frame camera's brightest pixel, and its levels."""
 METHODS = ("events", "intensity centroid", "frame camera")
-
-Array = NDArray[np.float64]
 
 
 class _Target(NamedTuple):

@@ -291,9 +291,7 @@ CALLS: dict[str, Call] = {
         returns=("last", text()),
         line_width_px=(20.0, number(0.0, 721.0)),
         height=(720, integer(0, 5000)),
-        events_min=(1, integer(0)),
         sigma_factor=(0.24, number(-1.0)),
-        sigma_floor_px=(0.2, number(-1.0)),
     ),
     "line.relative_reflectance": call(
         line.relative_reflectance,

@@ -204,6 +204,11 @@ def _named(target: Path) -> Iterator[None]:
         ) from error
 
 
+def config_path(name: str) -> Path | None:
+    """Return the path of a file in ``config/``, ``None`` when there is none."""
+    return next((path for f in config_folders() if (path := f / name).is_file()), None)
+
+
 def config_folders() -> list[Path]:
     """Return where ``config/`` may lie: source tree, pip-installed package, colcon's share."""
     here = Path(__file__).absolute()

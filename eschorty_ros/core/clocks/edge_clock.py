@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.arrays import TIME_LIMIT
 from eschorty_ros.core.clocks.clock_line import NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.edge_fit import EdgeFit, fit_edges
-from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+from eschorty_ros.core.clocks.pulses import PulseTrain, checked_edges, leading_edges
 from eschorty_ros.core.clocks.stage_track import StageTrack
 
 _WINDOW_US = 60_000_000
@@ -46,12 +45,7 @@ class EdgeClock:
 
     def add(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
         """Append edges of the trigger input, in time order; 1 for rising ones."""
-        t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-        polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
-        if t_us.shape != polarity.shape:
-            raise ArgumentError(
-                f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"
-            )
+        t_us, polarity = checked_edges(t_us, polarity)
         if t_us.size == 0:
             return
         t_us = np.concatenate([self._t_us, t_us])

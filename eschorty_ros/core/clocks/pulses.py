@@ -46,6 +46,19 @@ class PulseTrain:
         return reals("position_mm", position_mm) - pulse_mm
 
 
+def checked_edges(
+    t_us: NDArray[np.int64], polarity: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return times and polarities of edges; raise ``ArgumentError`` where they are none."""
+    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
+    if t_us.shape != polarity.shape:
+        raise ArgumentError(
+            f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"
+        )
+    return t_us, polarity
+
+
 def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return the edges with which the pulses begin, out of rising and falling ones.
 
@@ -57,12 +70,7 @@ def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArr
     - ``t_us``: Shape (n,). In time order.
     - ``polarity``: Shape (n,). 1 for rising.
     """
-    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-    polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
-    if t_us.shape != polarity.shape:
-        raise ArgumentError(
-            f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"
-        )
+    t_us, polarity = checked_edges(t_us, polarity)
     rising = polarity == 1
     if rising.all() or not rising.any():
         return t_us

@@ -9,8 +9,6 @@ nine; the cells are wide because the line runs along the columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import int32, int64, typeof, types, uint8, uint16, uint64
 
@@ -32,15 +30,6 @@ _STATE = ("origin_us", "started", "window_us", "width", "height", "pitch")
 _WINDOW_MAX_US = 1_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class FilterCounters:
-    """Events kept, removed for lack of support, and dropped because they are off the sensor."""
-
-    kept: int = 0
-    removed: int = 0
-    outside: int = 0
-
-
 class ActivityFilter:
     """Streaming background-activity filter; the result does not depend on how events are split.
 
@@ -60,24 +49,14 @@ class ActivityFilter:
         self.width, self.height, self.window_us = int(width), int(height), int(window_us)
         # One cell of border on each side, so that no neighbour needs a check.
         self._pitch = ((self.width + 7) >> _COLUMN_BITS) + 2
-        self._size = self._pitch * (((self.height + 3) >> _ROW_BITS) + 2)
         self._buffers = event_arrays(0)
-        self.reset()
-
-    def reset(self) -> None:
-        """Drop all events and counts."""
-        self._cells = np.full(self._size, _NEVER, dtype=np.int32)
+        size = self._pitch * (((self.height + 3) >> _ROW_BITS) + 2)
+        self._cells = np.full(size, _NEVER, dtype=np.int32)
         self._state = record(*_STATE)
         state = self._state
         state["window_us"], state["pitch"] = self.window_us, self._pitch
         state["width"], state["height"] = self.width, self.height
-        self._counts = [0, 0, 0]
         self._newest_us = -TIME_LIMIT
-
-    @property
-    def counters(self) -> FilterCounters:
-        """Snapshot of the counts since construction or ``reset``."""
-        return FilterCounters(*self._counts)
 
     def filter(self, events: Events) -> Events:
         """Return the supported events: views of reused buffers, valid until the next call.
@@ -98,11 +77,7 @@ class ActivityFilter:
             self._state["origin_us"], self._state["started"] = t_us[0], 1
         if size:
             self._newest_us = int(t_us[-1])
-        kept, outside = _filter(
-            t_us, columns, rows, polarities, self._buffers, self._cells, self._state
-        )
-        for k, count in enumerate((kept, size - kept - outside, outside)):
-            self._counts[k] += int(count)
+        kept = _filter(t_us, columns, rows, polarities, self._buffers, self._cells, self._state)
         t, x, y, p = self._buffers
         return Events(t[:kept], x[:kept], y[:kept], p[:kept], events.triggers)
 
@@ -141,12 +116,11 @@ def _neighbours_fresh(cells, cell, pitch, oldest):
     )
 
 
-@kernel(types.UniTuple(uint64, 2)(_I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], _S))
+@kernel(uint64(_I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], _S))
 def _filter(t_in, x_in, y_in, p_in, out, cells, s):
-    """Compact the supported events into ``out``; return kept and outside counts."""
+    """Compact the supported events into ``out``; return their number."""
     t_out, x_out, y_out, p_out = out
     n = np.uint64(0)
-    outside = np.uint64(0)
     pitch = np.uint64(s.pitch)
     for index in range(t_in.size):
         k = np.uintp(index)
@@ -154,7 +128,6 @@ def _filter(t_in, x_in, y_in, p_in, out, cells, s):
         x = np.uint64(x_in[k])
         y = np.uint64(y_in[k])
         if x >= np.uint64(s.width) or y >= np.uint64(s.height):
-            outside += np.uint64(1)
             continue
         if t - s.origin_us >= _REBASE_US:
             _rebase(cells, s, t)
@@ -175,4 +148,4 @@ def _filter(t_in, x_in, y_in, p_in, out, cells, s):
         y_out[n] = np.uint16(y)
         p_out[n] = p_in[k]
         n += np.uint64(kept)
-    return n, outside
+    return n

@@ -50,9 +50,7 @@ def estimate(
     returns: str = "strongest",
     line_width_px: float = 20.0,
     height: int = 720,
-    events_min: int = 1,
     sigma_factor: float = 0.0,
-    sigma_floor_px: float = SIGMA_FLOOR_PX,
 ) -> Centroids:
     """Return the row of the line in each column, independently of the others.
 
@@ -77,8 +75,7 @@ def estimate(
       the least row, hence the nearest.
     - ``line_width_px``: Full width of the line at half maximum, rows.
     - ``height``: Rows of the sensor, at most 1023.
-    - ``events_min``: Columns with fewer events in the window give NaN.
-    - ``sigma_factor``, ``sigma_floor_px``: Error model of ``sigma_row``, see `sigma`.
+    - ``sigma_factor``: Error model of ``sigma_row``, see `sigma`.
 
     Raises ``ArgumentError`` when an argument is not as described above.
 
@@ -96,7 +93,6 @@ def estimate(
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
-    integer("events_min", events_min, 1, 1 << 31)
     method_code, returns_code = check_method(method, returns)
     if method == "learned":
         raise ArgumentError("centroid 'learned' follows a stream; choose another for columns alone")
@@ -104,12 +100,12 @@ def estimate(
         method=method_code,
         returns=returns_code,
         seeded=False,
-        events_min=events_min,
+        events_min=1,
         sensor_rows=height,
         rows_taken=height,
         half_max=half_width_fixed(line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * float(line_width_px) ** 2,
-        error_model=error_model(method, sigma_factor, sigma_floor_px),
+        error_model=error_model(method, sigma_factor, SIGMA_FLOOR_PX),
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()

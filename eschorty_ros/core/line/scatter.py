@@ -98,10 +98,10 @@ def _forget_scatter(scatter):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, variance, averaged, edge_px, sums, measures_lengths):
+def _add_differences(row, sigma2, variance, averaged, sums, measures_lengths):
     """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
 
-    Differences above ``edge_px`` are left out: edges of the surface, but where most are as large.
+    Differences above ``_EDGE_PX`` are left out: edges of the surface, but where most are as large.
     """
     columns = row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
@@ -111,7 +111,7 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums, measures_le
         for c in range(np.uintp(begin), np.uintp(end)):
             most = max(most, averaged[c])
         apart = max(APART, int(most) // 2 + 1)
-        largest = max(edge_px / np.sqrt(most), _DEVIATIONS_MAX * usual)
+        largest = max(_EDGE_PX / np.sqrt(most), _DEVIATIONS_MAX * usual)
         first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
@@ -194,9 +194,7 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(
-        rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums, True
-    )
+    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, sums, True)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
@@ -223,9 +221,7 @@ def _scale_smoothed(rows, scatter, smoothing):
     """Scale the smoothed variances of a profile by the scatter left; add what neighbours share."""
     returns, columns = rows.row.shape
     sums, sigma2 = scatter.smoothed, smoothing.sigma2
-    _add_differences(
-        smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], _EDGE_PX, sums, False
-    )
+    _add_differences(smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], sums, False)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0

@@ -15,7 +15,7 @@ import yaml
 
 from eschorty_ros.core.base.arrays import file_path, short
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
-from eschorty_ros.core.base.files import BARE_NAME, atomic_write, config_folders, is_bare_name
+from eschorty_ros.core.base.files import BARE_NAME, atomic_write, config_path, is_bare_name
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import parse_yaml, read_yaml
 from eschorty_ros.core.optics.range_model import (
@@ -297,8 +297,7 @@ def _shipped(name: str) -> Path | None:
     """Return the file of a calibration in ``config/``, ``None`` when there is none."""
     if not _may_be_shipped(name):
         return None
-    candidates = (folder / f"{name}.yaml" for folder in config_folders())
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return config_path(f"{name}.yaml")
 
 
 def _find(name_or_path: str | os.PathLike[str]) -> Path:
@@ -318,8 +317,9 @@ def config_file(name: str) -> Path:
 
     Raises ``CalibrationError`` when there is none of that name.
     """
-    wanted = file_path("name", name)
-    for folder in config_folders():
-        if (folder / wanted).is_file():
-            return folder / wanted
-    raise CalibrationError(f"name is {name!r}, and config/ has no such file; give its path instead")
+    found = config_path(os.fspath(file_path("name", name)))
+    if found is None:
+        raise CalibrationError(
+            f"name is {name!r}, and config/ has no such file; give its path instead"
+        )
+    return found

@@ -13,12 +13,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer, integer_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
+
+# Columns with fewer events give no point.
+_EVENTS_MIN = 4
 
 
 def decode_all(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -71,7 +74,6 @@ def reconstruct(
     row: ArrayLike,
     model: RangeModel,
     modulation: Modulation,
-    events_min: int = 4,
 ) -> Profiles:
     """Return the column means of every modulation period.
 
@@ -81,7 +83,6 @@ def reconstruct(
     - ``column``, ``row``: Integers of shape (n,), inside the sensor of ``model``.
     - ``modulation``: ``on_edge_us`` gives the periods' phase; the first event's time when it is
       ``None``.
-    - ``events_min``: Columns with fewer events give no point.
 
     Raises ``ArgumentError`` when the three arrays differ in length, times fall or a pixel is off
     the sensor.
@@ -89,7 +90,6 @@ def reconstruct(
     t = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     x = integer_vector("column", column, np.int64, 0, model.columns - 1)
     y = integer_vector("row", row, np.int64, 0, model.rows - 1)
-    integer("events_min", events_min, 1, 1 << 31)
     if not t.shape == x.shape == y.shape:
         raise ArgumentError(
             f"t_us, column and row have {t.size}, {x.size} and {y.size} entries; give equal numbers"
@@ -108,7 +108,7 @@ def reconstruct(
     edges = np.array([anchored.edge_us(k) for k in range(first, last + 1)], dtype=np.int64)
     cuts = np.searchsorted(t, edges)
     windows = [
-        _window(t[a:b], x[a:b], y[a:b], model, first + k, int(edges[k]), events_min)
+        _window(t[a:b], x[a:b], y[a:b], model, first + k, int(edges[k]))
         for k, (a, b) in enumerate(pairwise(cuts))
         if b > a
     ]
@@ -122,13 +122,12 @@ def _window(
     model: RangeModel,
     period: int,
     edge_us: int,
-    events_min: int,
 ) -> Profiles:
     size = model.columns * model.rows
     address = x.astype(np.int64) * model.rows + y
     frame = np.bincount(address, minlength=size).reshape(model.columns, model.rows)
     count = frame.sum(axis=1)
-    lit = np.flatnonzero(count >= events_min)
+    lit = np.flatnonzero(count >= _EVENTS_MIN)
     n = count[lit]
     seen = frame[lit].astype(np.float64)
     rows = np.arange(model.rows, dtype=np.float64)

@@ -2,7 +2,6 @@
 
 from eschorty_ros.core.storage.cloud import (
     FEW_EVENTS,
-    FLAGS,
     MIXED,
     POINT_DTYPE,
     REFLECTANCE_DTYPE,
@@ -37,7 +36,6 @@ __all__ = [
     "CALIBRATION_FILE",
     "EVENTS_FILE",
     "FEW_EVENTS",
-    "FLAGS",
     "LASER_FILE",
     "MIXED",
     "POINT_DTYPE",

@@ -29,11 +29,10 @@ POINT_DTYPE = np.dtype(
 )
 """Packed, 32 bytes: x y z sigma in metres, intensity in events, t in seconds, column in px.
 
-``flags`` are bits of ``FLAGS``, 0 for a good point.
+``flags`` are bits, 0 for a good point.
 """
 
 MIXED, SENSOR_EDGE, FEW_EVENTS = 1, 2, 4
-FLAGS = {"mixed": MIXED, "sensor_edge": SENSOR_EDGE, "few_events": FEW_EVENTS}
 """Bits of a point's flags: the line is on two surfaces, cut by the edge, or of few events."""
 
 REFLECTANCE_DTYPE = np.dtype(

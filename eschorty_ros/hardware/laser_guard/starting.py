@@ -12,9 +12,9 @@ from pathlib import Path
 
 from eschorty_ros.core.base.errors import DeviceGoneError
 
+_CONNECT_S = 2.0
 # The guard runs the package that runs here, wherever it lies, and searches no current folder: with
 # -P and the package's own folder on the path no longer than it takes to find the package.
-_CONNECT_S = 2.0
 _START_GUARD = (
     "import sys; sys.path.insert(0, sys.argv.pop(1)); import eschorty_ros; del sys.path[0]; "
     "from eschorty_ros.hardware.laser_guard.guard import main; main()"

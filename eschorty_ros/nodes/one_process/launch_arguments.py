@@ -12,7 +12,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from eschorty_ros.control.scan_sequence import ScanRequest, check_request
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.base.files import config_folders
+from eschorty_ros.core.base.files import config_path
 from eschorty_ros.core.calibration import read_distances
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import load_recording
@@ -41,8 +41,7 @@ class Argument:
 
 def shared_file(name: str) -> Path:
     """Return a file in ``config/``."""
-    paths = [folder / name for folder in config_folders()]
-    return next((path for path in paths if path.is_file()), Path(name))
+    return config_path(name) or Path(name)
 
 
 _DEVICES = (

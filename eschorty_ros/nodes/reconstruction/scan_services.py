@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
+from eschorty_ros.core.base.files import BARE_NAME, is_bare_name
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
@@ -35,15 +36,6 @@ _WORKER_S = 10.0
 _ASSEMBLE_S = 30.0
 # A recording that a disk takes longer for goes on without the client.
 _RECORD_S = 5.0
-# It is the name of a folder, and part of texts of 200 characters.
-_NAME_MAX = 100
-
-
-def _name_fault(scan_id: str) -> str:
-    """Return why a scan's identifier is no name of a folder, ``""`` when it is one."""
-    if len(scan_id) > _NAME_MAX or "/" in scan_id or scan_id in (".", ".."):
-        return f"scan_id is {short(scan_id)}; give a name of {_NAME_MAX} characters, no path"
-    return ""
 
 
 class ScanServices:
@@ -126,7 +118,8 @@ class ScanServices:
         while fault and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
             fault = self._fault()
-        fault = fault or _name_fault(request.scan_id)
+        if not fault and not is_bare_name(request.scan_id):
+            fault = f"scan_id is {short(request.scan_id)}; give {BARE_NAME}"
         if fault:
             response.success, response.message = False, fault
             return response

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from eschorty_ros.core.base.files import config_folders
+from eschorty_ros.core.base.files import config_path
 
 HERE, NETWORK = "fastdds.xml", "two_hosts.xml"
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -26,12 +26,10 @@ def use_profile() -> None:
     chosen = any(name in os.environ for name in VARIABLES)
     if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:
         return
-    for folder in config_folders():
-        profile = folder / (HERE if here else NETWORK)
-        if profile.is_file():
-            os.environ[VARIABLES[0]] = str(profile)
-            os.environ.setdefault(_HISTORIES, "1")
-            if here:
-                # LOCALHOST would add shared memory to what the profile names.
-                os.environ[RANGE] = "SUBNET"
-            return
+    profile = config_path(HERE if here else NETWORK)
+    if profile is not None:
+        os.environ[VARIABLES[0]] = str(profile)
+        os.environ.setdefault(_HISTORIES, "1")
+        if here:
+            # LOCALHOST would add shared memory to what the profile names.
+            os.environ[RANGE] = "SUBNET"

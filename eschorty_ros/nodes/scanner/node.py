@@ -16,7 +16,6 @@ from rclpy.node import Node
 
 from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import (
-    PASSES_MAX,
     SPEED_MIN_MM_S,
     End,
     ScanFailure,
@@ -30,6 +29,7 @@ from eschorty_ros.control.scan_sequence import (
 )
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ
+from eschorty_ros.live.sweep_coverage import PASSES_MAX
 from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.ros.instrument_client import ScanClient

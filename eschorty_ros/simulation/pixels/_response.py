@@ -75,7 +75,7 @@ def _advanced(signal, t_us):
 
 @kernel
 def _fade(x):
-    """Return ``exp(-x)`` to 2e-6: faster, and enough for sums of risks."""
+    """Return ``exp(-x)`` to 2e-6, faster."""
     if not -0.5 < x < 0.5:
         return math.exp(-x)
     x = -x

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scenes.scene import Array, RecentRays, sheet
+from eschorty_ros.simulation.scenes.scene import RecentRays, sheet
 
 HEAD_HALF_WIDTH_MM = 72.0
 HEAD_HALF_HEIGHT_MM = 112.0

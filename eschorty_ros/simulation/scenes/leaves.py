@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scenes.scene import Array, RecentRays, sheet
+from eschorty_ros.simulation.scenes.scene import RecentRays, sheet
 
 SEPARATION_MM = 2.2
 """Between neighbouring levels of a layer: the paper's leaves at 1.32 m (Fig. 8)."""

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.open3d_module import load_open3d
-from eschorty_ros.simulation.scenes.scene import Array, UniformReflectance, sheet
+from eschorty_ros.simulation.scenes.scene import UniformReflectance, sheet
 
 
 class Mesh(UniformReflectance):

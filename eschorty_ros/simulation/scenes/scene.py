@@ -8,14 +8,13 @@ At stage position ``s`` the sheet is a fan of rays from ``(-b, s, 0)`` with the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import RangeModel
-
-Array: TypeAlias = NDArray[np.float64]
 
 
 class Scene(Protocol):

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scenes.scene import Array, UniformReflectance, sheet
+from eschorty_ros.simulation.scenes.scene import UniformReflectance, sheet
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scenes.scene import Array, Scene
+from eschorty_ros.simulation.scenes.scene import Scene
 
 NAMED_MM = 838.0, 1450.0
 """Span that holds every named scene; a build that sees all of it sees them as they are."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes import Scene
-from eschorty_ros.simulation.scenes.scene import Array
 
 _STEP_MM = 0.25
 """Stage travel between the rays that are cast; shadows end at its multiples."""
