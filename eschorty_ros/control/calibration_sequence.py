@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-from eschorty_ros.control.scan_sequence import End, Instrument, Outcome, ScanCanceled, check_laser
-from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.control.scan_sequence import End, Instrument, Outcome, check_laser, end_light
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.live.calibration_capture import CaptureRequest
@@ -77,45 +77,28 @@ def run_capture(
     collecting = False
     sweep = request.sweep
     try:
-        instrument.report("preparing")
-        # First, because it fails while a scan is under way.
-        begin()
-        collecting = True
-        instrument.check_nodes()
-        instrument.configure_laser(request.frequency_hz, request.duty)
-        if sweep is not None:
-            instrument.move(sweep.start_mm, min(_APPROACH_MM_S, sweep.speed_mm_s))
-        instrument.laser_on()
-        instrument.watch(True)
-        instrument.report("capturing")
-        if sweep is None:
-            instrument.collect(request.capture_s)
-        else:
-            instrument.move(sweep.stop_mm, sweep.speed_mm_s)
-            instrument.move(sweep.start_mm, sweep.speed_mm_s)
-        outcome.end = End.SUCCEEDED
-    except ScanCanceled:
-        outcome.end, outcome.message = End.CANCELED, "canceled"
-    except EschortyError as error:
-        outcome.message = str(error)
+        with outcome.steps():
+            instrument.report("preparing")
+            # First, because it fails while a scan is under way.
+            begin()
+            collecting = True
+            instrument.check_nodes()
+            instrument.configure_laser(request.frequency_hz, request.duty)
+            if sweep is not None:
+                instrument.move(sweep.start_mm, min(_APPROACH_MM_S, sweep.speed_mm_s))
+            instrument.laser_on()
+            instrument.watch(True)
+            instrument.report("capturing")
+            if sweep is None:
+                instrument.collect(request.capture_s)
+            else:
+                instrument.move(sweep.stop_mm, sweep.speed_mm_s)
+                instrument.move(sweep.start_mm, sweep.speed_mm_s)
     finally:
-        _finish(instrument, outcome, finish if collecting else None)
+        end_light(instrument, outcome)
+        if outcome.end is End.SUCCEEDED:
+            instrument.report("finishing")
+            outcome.attempt(lambda: instrument.drain(_DRAIN_S, _DRAIN_WITHIN_S))
+        if collecting:
+            outcome.attempt(finish)
     return outcome
-
-
-def _finish(
-    instrument: CaptureInstrument, outcome: Outcome, finish: Callable[[], None] | None
-) -> None:
-    """Run the way out of every capture: laser off first."""
-    instrument.shield()
-    instrument.watch(False)
-    steps: list[Callable[[], None]] = [instrument.laser_off]
-    if outcome.end is not End.SUCCEEDED:
-        steps.append(instrument.stop_stage)
-    elif finish is not None:
-        instrument.report("finishing")
-        steps.append(lambda: instrument.drain(_DRAIN_S, _DRAIN_WITHIN_S))
-    if finish is not None:
-        steps.append(finish)
-    for step in steps:
-        outcome.attempt(step)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import pairwise
@@ -109,6 +110,17 @@ class Outcome:
 
     end: End = End.ABORTED
     message: str = ""
+
+    @contextmanager
+    def steps(self) -> Iterator[None]:
+        """Do the steps of a sequence; it ends as they do."""
+        try:
+            yield
+            self.end = End.SUCCEEDED
+        except ScanCanceled:
+            self.end, self.message = End.CANCELED, "canceled"
+        except EschortyError as error:
+            self.message = str(error)
 
     def attempt(self, step: Callable[[], None]) -> None:
         """Run a step of the way out; the sequence fails with it, for the first reason that came."""
@@ -282,29 +294,34 @@ class SweepProgress:
         return min(self._gone_mm / self._way_mm, 1.0)
 
 
+def end_light(instrument: Instrument, outcome: Outcome) -> None:
+    """Switch the laser off; unless the sequence has succeeded, stop the stage."""
+    instrument.shield()
+    instrument.watch(False)
+    outcome.attempt(instrument.laser_off)
+    if outcome.end is not End.SUCCEEDED:
+        outcome.attempt(instrument.stop_stage)
+
+
 def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
     """Do one scan; raise no ``EschortyError``, leave the laser off and the stage at rest."""
     outcome = ScanOutcome()
     collecting = False
     begin_mm, end_mm = sweep_ends_mm(request, limits)
     try:
-        instrument.report("preparing")
-        instrument.check_nodes()
-        instrument.configure_laser(request.frequency_hz, request.duty)
-        instrument.report("to_start")
-        instrument.move(begin_mm, limits.approach_mm_s)
-        instrument.begin_scan(request)
-        collecting = True
-        instrument.laser_on()
-        instrument.watch(True)
-        instrument.report("sweeping")
-        for number in range(request.passes):
-            instrument.move(begin_mm if number % 2 else end_mm, request.speed_mm_s)
-        outcome.end = End.SUCCEEDED
-    except ScanCanceled:
-        outcome.end, outcome.message = End.CANCELED, "canceled"
-    except EschortyError as error:
-        outcome.message = str(error)
+        with outcome.steps():
+            instrument.report("preparing")
+            instrument.check_nodes()
+            instrument.configure_laser(request.frequency_hz, request.duty)
+            instrument.report("to_start")
+            instrument.move(begin_mm, limits.approach_mm_s)
+            instrument.begin_scan(request)
+            collecting = True
+            instrument.laser_on()
+            instrument.watch(True)
+            instrument.report("sweeping")
+            for number in range(request.passes):
+                instrument.move(begin_mm if number % 2 else end_mm, request.speed_mm_s)
     finally:
         _finish(instrument, request, limits, outcome, collecting)
     return outcome
@@ -318,11 +335,7 @@ def _finish(
     collecting: bool,
 ) -> None:
     """Run the way out of every scan: laser off first."""
-    instrument.shield()
-    instrument.watch(False)
-    outcome.attempt(instrument.laser_off)
-    if outcome.end is not End.SUCCEEDED:
-        outcome.attempt(instrument.stop_stage)
+    end_light(instrument, outcome)
     if not collecting:
         return
     instrument.report("finishing")

@@ -52,7 +52,9 @@ def test_a_failure_on_the_way_out_fails_the_capture_and_the_rest_still_runs(step
     instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
     outcome = instrument.capture(RESTING)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
-    assert instrument.steps()[-3:] == ["laser_off", "drain", "finish"]
+    # A laser that may still be on does not wait for the last events.
+    between = "stop_stage" if step == "laser_off" else "drain"
+    assert instrument.steps()[-3:] == ["laser_off", between, "finish"]
 
 
 @pytest.mark.parametrize(
