@@ -22,7 +22,7 @@ from eschorty_ros.core.storage import Recording, load_recording, write_cloud
 from eschorty_ros.report.accuracy import Accuracy, measure_recorded
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Cloud:
     """The points of a recording.
 
@@ -47,6 +47,10 @@ class Cloud:
     counters: dict[str, int]
     recording: Recording
     organized: NDArray[np.void] | None = None
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.points):,} points, {self.profiles.profile_count:,} profiles"
+        return f"Cloud({counts}, {len(self.warnings)} warnings)"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the points as ``.pcd`` or ``.ply``; without points an ArgumentError."""
@@ -93,10 +97,12 @@ def reconstruct(
     unknown = sorted(settings.keys() - {field.name for field in fields(Settings)})
     if unknown:
         raise ArgumentError(f"there is no setting {unknown[0]!r}; `help(es.Settings)` lists them")
-    loaded = recording if isinstance(recording, Recording) else load_recording(recording)
     if not (calibration is None or isinstance(calibration, Calibration)):
         calibration = load_calibration(calibration)
-    loaded = loaded.corrected(calibration, frequency_hz)
+    if isinstance(recording, Recording):
+        loaded = recording.corrected(calibration, frequency_hz)
+    else:
+        loaded = load_recording(recording, calibration, frequency_hz)
     chosen = replace(recorded_settings(loaded), **settings)
     found = reconstruct_recording(loaded, chosen, progress)
     return Cloud(

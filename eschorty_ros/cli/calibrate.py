@@ -275,8 +275,10 @@ def _recorded(
     for line in match.rejected:
         click.echo(f"left out: {line}")
     if match.targets is None:
+        near_mm, far_mm = design.model().range_limits_mm
         raise FitError(
-            f"--distances is {distances}; no post is there; check the ranges and --nominal"
+            f"--distances is {distances}; no post is there; give millimetres, {near_mm:.0f} to "
+            f"{far_mm:.0f} with this --nominal"
         )
     return match.targets
 
@@ -329,7 +331,11 @@ def _show(report: CalibrationReport) -> None:
     show(made)
     for left_out in report.rejected:
         click.echo(f"rejected: {left_out.label}: {left_out.reason}")
-    for line in report.verdicts:
+    reservations = [line for line in report.verdicts if line != "identifiable"]
+    known = "identifiable" if "identifiable" in report.verdicts else "not identifiable"
+    count = "1 reservation" if len(reservations) == 1 else f"{len(reservations)} reservations"
+    click.echo(f"verdict: {known}, {count}")
+    for line in reservations:
         click.echo(f"verdict: {line}")
 
 

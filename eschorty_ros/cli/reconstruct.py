@@ -221,7 +221,7 @@ def reconstruct_to(
     check_writable(target)
     if not is_bag(recording):
         build = None if calibration is None else load_calibration(calibration)
-        loaded = load_recording(recording).corrected(build, frequency)
+        loaded = load_recording(recording, build, frequency)
         return _reconstruct(loaded, target, jobs, given, show)
     with temporary_folder() as made:
         folder = made / recording.stem

@@ -13,8 +13,11 @@ from eschorty_ros.core.storage.raw_file import RawReader
 _TURN_US = 1 << 24
 _CHUNK_BYTES = 1 << 19
 _MAPPED_BYTES = 1 << 27
-# Share of the shorter one of events and positions that both have to cover.
+# Share of the shorter one of events and positions that both have to cover; they begin together.
 _COVERED = 0.9
+_TOGETHER_US = 2_000_000
+# A camera is not on for longer; later times are of another clock.
+_ON_US = 7 * 24 * 3_600_000_000
 
 
 def in_turn(recording: Recording) -> tuple[Recording, list[str]]:
@@ -33,7 +36,8 @@ def in_turn(recording: Recording) -> tuple[Recording, list[str]]:
     off_us = turns * _TURN_US
     both_us = min(begin_us + span_us, last_us - off_us) - max(begin_us, first_us - off_us)
     covered = both_us > _COVERED * min(span_us, last_us - first_us)
-    if turns < 1 or first_us <= begin_us + span_us or not covered:
+    together = abs(first_us - off_us - begin_us) < _TOGETHER_US and off_us < _ON_US
+    if turns < 1 or first_us <= begin_us + span_us or not (covered and together):
         return recording, []
     line = (
         f"the events begin {turns} x 16.777216 s, turns of the camera's 24-bit clock, before "

@@ -16,24 +16,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.reconstruction.clock_turns import in_turn
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import (
+    check_sensor,
     recording_warnings,
     shown_frequency_hz,
 )
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import SETTINGS_FILE, TRUTH_FILE, between
+from eschorty_ros.core.storage.recording import SETTINGS_FILE, STAGE_FILE, TRUTH_FILE, between
 
 # Bytes of the file that are mapped at a time, in one thread and in several.
 _PASS_BYTES = 1 << 20
 _WINDOWS_BYTES = 1 << 27
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
+_SPEED_MAX_MM_S = 10_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +84,12 @@ def reconstruct_recording(
     - ``folder``: Where the points are written while the recording is read; the result's are maps of
       files there, and the memory does not grow with the recording. In memory when left out.
 
-    Raises ``FormatError`` when the event file is not EVT3.
+    Raises ``FormatError`` when the event file is not EVT3 or the stage is too fast, and
+    ``CalibrationError`` when the calibration is of another sensor.
     """
     began = time.perf_counter()
     settings = settings or recorded_settings(recording)
+    check_sensor(recording)
     recording, turned = in_turn(recording)
     settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
     jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
@@ -274,9 +279,16 @@ def stage_speed_mm_s(recording: Recording) -> float:
     t_us = np.linspace(first_us, last_us, _SPEED_SAMPLES).astype(np.int64)
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = np.diff(recording.stage.position_mm(t_us)) / np.diff(t_us) * 1e6
-    speed = speed[np.isfinite(speed)]
+    # A sample that is wrong makes two intervals with a speed that the stage does not have.
+    near = np.pad(speed[np.isfinite(speed)], 2, mode="edge")
+    speed = np.median(np.lib.stride_tricks.sliding_window_view(near, 5), axis=1)
     cruising = speed[np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)]
     if not cruising.size:
         return 0.0
     along_mm_s = math.copysign(float(np.median(np.abs(cruising))), cruising[0])
+    if abs(along_mm_s) > _SPEED_MAX_MM_S:
+        raise FormatError(
+            f"{recording.path / STAGE_FILE}: the stage moves at {abs(along_mm_s) * 1e-3:.3g} m/s; "
+            "write t_us in microseconds and position_mm in millimetres"
+        )
     return along_mm_s * recording.calibration.stage_direction[1]

@@ -25,7 +25,7 @@ from eschorty_ros.core.reconstruction.readout_window import window_model, window
 from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
-from eschorty_ros.core.reconstruction.stream_faults import stream_faults
+from eschorty_ros.core.reconstruction.stream_faults import is_unreadable, stream_faults
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 
 _PIECE_WORDS = 1 << 16
@@ -350,6 +350,9 @@ class Reconstructor:
             found.append(
                 "no modulation phase found in the events; periods are cut from the first event on"
             )
+        found += stream_faults(counts)
+        if is_unreadable(counts):
+            return found
         if 2 * counts["events_gated"] > counts["events"]:
             share = counts["events_gated"] / counts["events"]
             found.append(
@@ -369,7 +372,6 @@ class Reconstructor:
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
                 "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
-        found += stream_faults(counts)
         if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
             found.append(
                 f"the line is wider than line_width_px = {self.settings.line_width_px:g} in "

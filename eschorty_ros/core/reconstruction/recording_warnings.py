@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from eschorty_ros.core.base.errors import CalibrationError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -24,6 +25,8 @@ _REST_MM = 0.003
 # once.
 _LEFT_SHARE = 0.02
 _LEFT_US = 100_000
+# Speed of a jump, mm/s and over that of the sweep.
+_FAST_MM_S, _JUMP = 1000.0, 10.0
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 _LOSSES = {
@@ -74,20 +77,8 @@ def recording_warnings(
     if span_us is None:
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
     stated_hz = recording.modulation.frequency_hz
-    found += _geometry(recording)
     samples = recording.stage_samples
-    way_mm = float(np.ptp(samples["position_mm"]))
-    if _REST_MM < way_mm <= _METRES_MAX:
-        found.append(
-            f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
-        )
-    after = samples["position_mm"][np.searchsorted(samples["t_us"], span_us[1] + _LEFT_US) :]
-    if after.size and np.ptp(after) > max(_LEFT_SHARE * way_mm, _REST_MM):
-        found.append(
-            f"the events end at {span_us[1] * 1e-6:.3f} s, and the stage moves {np.ptp(after):.3g} "
-            f"mm after that; where these were scanned, too, {recording.events_path.name} is cut: "
-            "copy it again"
-        )
+    found += _stage_faults(recording, span_us)
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
@@ -111,6 +102,55 @@ def recording_warnings(
     return [*found, *_few_points(settings, counters, points, dark, shown_hz is not None)]
 
 
+def _stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
+    """Return one line for each contradiction between the stage's positions and the events' time."""
+    t_us, position_mm = (recording.stage_samples[name] for name in ("t_us", "position_mm"))
+    found, name = [], recording.events_path.name
+    way_mm = float(np.ptp(position_mm))
+    if _REST_MM < way_mm <= _METRES_MAX:
+        found.append(
+            f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
+        )
+    if way_mm <= _REST_MM and t_us.size > 1:
+        found.append(
+            f"the stage stays at {position_mm[0]:.6g} mm in stage.csv: all profiles are in one "
+            "place; where it moved, give its positions"
+        )
+    if recording.calibration_replaced:
+        found.append(
+            f"the recording is of {recording.calibration_replaced} and reconstructed with "
+            f"{recording.calibration.name}; check that this is its instrument"
+        )
+    speed_mm_s = np.abs(np.diff(position_mm)) / np.diff(t_us) * 1e6
+    jump = int(np.argmax(speed_mm_s)) if t_us.size > 1 else 0
+    if t_us.size > 1 and speed_mm_s[jump] > max(_JUMP * np.quantile(speed_mm_s, 0.9), _FAST_MM_S):
+        found.append(
+            f"the stage jumps from {position_mm[jump]:.6g} to {position_mm[jump + 1]:.6g} mm at "
+            f"{t_us[jump + 1] * 1e-6:.3f} s in stage.csv; remove the sample that is wrong"
+        )
+    least_mm = max(_LEFT_SHARE * way_mm, _REST_MM)
+    begin_us, end_us = span_us
+    if t_us[0] > end_us or t_us[-1] < begin_us:
+        # Another line says that they do not overlap.
+        return found
+    after = position_mm[np.searchsorted(t_us, end_us + _LEFT_US) :]
+    if after.size and np.ptp(after) > least_mm:
+        found.append(
+            f"the events end at {end_us * 1e-6:.3f} s, and the stage moves {np.ptp(after):.3g} mm "
+            f"after that; where these were scanned, too, {name} is cut: copy it again"
+        )
+    before = position_mm[: np.searchsorted(t_us, begin_us - _LEFT_US)]
+    around = position_mm[slice(*np.searchsorted(t_us, (begin_us - _LEFT_US, begin_us + _LEFT_US)))]
+    under_way = around.size > 1 and np.ptp(around) > _REST_MM
+    if before.size and np.ptp(before) > least_mm and under_way:
+        found.append(
+            f"the events begin at {begin_us * 1e-6:.3f} s, and the stage has moved "
+            f"{np.ptp(before):.3g} mm before; where these were scanned, too, the beginning of "
+            f"{name} is missing: copy it again"
+        )
+    return found
+
+
 def without_modulation(events: int, frequency_hz: float) -> str:
     """Return the cause of few points where the laser's modulation is not in the events."""
     if not events:
@@ -121,17 +161,16 @@ def without_modulation(events: int, frequency_hz: float) -> str:
     )
 
 
-def _geometry(recording: Recording) -> list[str]:
-    """Compare the sensor of the events with that of the calibration."""
+def check_sensor(recording: Recording) -> None:
+    """Raise ``CalibrationError`` when the calibration is of another sensor than the events."""
     header, build = RawReader(recording.events_path).header, recording.calibration
     named = "geometry" in header or "width=" in header.get("format", "")
-    if not named or (header.width, header.height) == (build.columns, build.rows):
-        return []
-    return [
-        f"{recording.events_path.name} is of a sensor of {header.width} x {header.height} and "
-        f"{build.name} of one of {build.columns} x {build.rows}; give the calibration of this "
-        "camera"
-    ]
+    if named and (header.width, header.height) != (build.columns, build.rows):
+        raise CalibrationError(
+            f"{recording.events_path.name} is of a sensor of {header.width} x {header.height} and "
+            f"{build.name} of one of {build.columns} x {build.rows}; give the calibration of this "
+            "camera"
+        )
 
 
 def _few_points(

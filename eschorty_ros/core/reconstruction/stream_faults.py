@@ -14,9 +14,21 @@ _FEWER_EVENTS = (
 )
 
 
+def is_unreadable(counts: Mapping[str, int]) -> bool:
+    """Return whether so many words are broken that what the others say has no meaning."""
+    return 4 * counts["broken_words"] > counts["events"]
+
+
 def stream_faults(counts: Mapping[str, int]) -> list[str]:
     """Return one line for each fault; ``counts`` are the counters of a `Reconstructor`."""
     found: list[str] = []
+    if counts["broken_words"] > _BROKEN_PER_GAP * (1 + counts["decoder_gaps"]):
+        found.append(
+            f"{counts['broken_words']} words of the events are not as EVT3 has them: bytes are "
+            "lost or changed; copy the file again, or check the camera's cable"
+        )
+    if is_unreadable(counts):
+        return found
     used, bridged = counts["triggers_used"], counts["edges_bridged"]
     if bridged > used > 0:
         found.append(
@@ -25,12 +37,8 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         )
     jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
     if jumps > 0:
-        found.append(f"the camera's time jumps forward {jumps} times: events are missing there")
-    if counts["broken_words"] > _BROKEN_PER_GAP * (1 + counts["decoder_gaps"]):
-        found.append(
-            f"{counts['broken_words']} words of the events are not as EVT3 has them: bytes are "
-            "lost or changed; copy the file again, or check the camera's cable"
-        )
+        times = "once" if jumps == 1 else f"{jumps} times"
+        found.append(f"the camera's time jumps forward {times}: events are missing there")
     if counts["sensor_drop_words"]:
         found.append(
             f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "

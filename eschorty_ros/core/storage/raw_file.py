@@ -21,6 +21,7 @@ from eschorty_ros.core.evt3 import words as w3
 CHUNK_BYTES = 128 * 1024
 _HEADER_MAX_BYTES = 64 * 1024
 _SIZE_MAX = 2048
+_GZIP = b"\x1f\x8b"
 _VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 _REMEDY = "convert it to EVT3 or record again with format EVT3"
 
@@ -148,6 +149,8 @@ class RawReader:
             if not ended:
                 values[key] = " ".join(value.split())
         if not values and not ended and not head.startswith(b"% "):
+            if head.startswith(_GZIP):
+                raise FormatError(f"{self.path} is compressed with gzip; run gunzip on it")
             if not self._looks_like_evt3(head):
                 raise FormatError(
                     f"{self.path} has no RAW header (first bytes {head[:8].hex(' ')}); "

@@ -102,7 +102,7 @@ class ScanLog(Schema):
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """The content of a recording folder.
 
@@ -124,6 +124,8 @@ class Recording:
         Settings of the reconstruction at that scan.
     marks : ndarray of MARK_DTYPE, shape (n,)
         Where bytes are missing and where the laser was switched on.
+    calibration_replaced : str
+        Name of the recording's own calibration, where one of another name is used.
     """
 
     path: Path
@@ -135,6 +137,10 @@ class Recording:
     scan: ScanLog | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     marks: NDArray[np.void] = field(default_factory=lambda: np.empty(0, MARK_DTYPE))
+    calibration_replaced: str = ""
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r}, {self.modulation}, {self.calibration.name})"
 
     def corrected(
         self, calibration: Calibration | None = None, frequency_hz: float | None = None
@@ -143,7 +149,12 @@ class Recording:
         modulation = self.modulation
         if frequency_hz is not None:
             modulation = replace(modulation, frequency_hz=frequency_hz)
-        return replace(self, calibration=calibration or self.calibration, modulation=modulation)
+        own = self.calibration
+        given = calibration or own
+        replaced = own.name if given.name != own.name else self.calibration_replaced
+        return replace(
+            self, calibration=given, modulation=modulation, calibration_replaced=replaced
+        )
 
     def earlier(self, by_us: int) -> Recording:
         """Return the recording with earlier times of the stage and of the laser's edge."""
@@ -164,8 +175,15 @@ class Recording:
         return read_truth_csv(file) if file.exists() else None
 
 
-def load_recording(path: str | os.PathLike[str]) -> Recording:
+def load_recording(
+    path: str | os.PathLike[str],
+    calibration: Calibration | None = None,
+    frequency_hz: float | None = None,
+) -> Recording:
     """Read a recording folder; the events themselves stay on disk.
+
+    ``calibration`` and ``frequency_hz`` of the laser stand in for the recording's own, which may
+    then be missing.
 
     Raises
     ------
@@ -175,23 +193,33 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     folder = file_path("path", path)
     if not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; give a recording folder; {RAW_ALONE}")
+    given = {CALIBRATION_FILE: calibration, LASER_FILE: frequency_hz}
     for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
-        if not (folder / name).is_file():
-            raise FormatError(f"{folder / name} is missing; add it to the recording")
+        if given.get(name) is None and not (folder / name).is_file():
+            packed = (folder / f"{name}.gz").is_file()
+            remedy = f"run gunzip on {name}.gz" if packed else "add it to the recording"
+            raise FormatError(f"{folder / name} is missing; {remedy}")
     samples = read_stage_csv(folder / STAGE_FILE)
     scan = read_scan_yaml(folder / SCAN_FILE) if (folder / SCAN_FILE).exists() else None
     settings, marks = folder / SETTINGS_FILE, folder / MARKS_FILE
-    return Recording(
+    laser, build = folder / LASER_FILE, folder / CALIBRATION_FILE
+    own = calibration if calibration and not build.is_file() else load_calibration(build)
+    if frequency_hz is not None and not laser.is_file():
+        modulation = Modulation(frequency_hz)
+    else:
+        modulation = read_laser_yaml(laser)
+    recording = Recording(
         path=folder,
         events_path=folder / EVENTS_FILE,
         stage=_track(samples, scan),
         stage_samples=samples,
-        modulation=read_laser_yaml(folder / LASER_FILE),
-        calibration=load_calibration(folder / CALIBRATION_FILE),
+        modulation=modulation,
+        calibration=own,
         scan=scan,
         settings=read_settings_yaml(settings) if settings.exists() else {},
         marks=read_marks_csv(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
     )
+    return recording.corrected(calibration, frequency_hz)
 
 
 def _track(samples: NDArray[np.void], scan: ScanLog | None) -> StageTrack:

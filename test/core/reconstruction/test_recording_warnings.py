@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from eschorty_ros.core.base.errors import CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
@@ -33,11 +34,27 @@ def with_stage(recording, later_us, part=slice(None), scale=1.0):
     return replace(recording, stage=track, stage_samples=samples)
 
 
-def with_half_of_the_events(recording):
+def with_half_of_the_events(recording, half=0):
     data = recording.events_path.read_bytes()
-    cut = recording.path.parent / "cut.raw"
-    cut.write_bytes(data[: len(data) // 4 * 2])
+    begin = data.index(b"% end\n") + 6
+    middle = begin + (len(data) - begin) // 4 * 2
+    cut = recording.path.parent / f"cut{half}.raw"
+    cut.write_bytes(data[:begin] + data[middle:] if half else data[:middle])
     return replace(recording, events_path=cut)
+
+
+def with_stage_at(recording, position_mm, part=slice(None)):
+    recording = with_stage(recording, 0)
+    recording.stage_samples["position_mm"][part] = position_mm
+    return with_stage(recording, 0)
+
+
+def with_broken_words(recording):
+    data = recording.events_path.read_bytes()
+    begin = data.index(b"% end\n") + 6
+    broken = recording.path.parent / "broken.raw"
+    broken.write_bytes(data[:begin] + b"x" + data[begin:])
+    return replace(recording, events_path=broken)
 
 
 @pytest.mark.parametrize("scene", ["plane", "posts"])
@@ -80,7 +97,14 @@ def test_stage_positions_of_a_later_turn_of_the_cameras_clock_are_those_of_the_e
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
         (lambda r: with_half_of_the_events(r), {}, "mm after that; where these were scanned", 1),
         (lambda r: with_stage(r, 0, scale=1e-3), {}, "moves by 0.03 mm in stage.csv; where", 1),
-        (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
+        (lambda r: with_half_of_the_events(r, 1), {}, "mm before; where these were scanned", 1),
+        (lambda r: with_stage_at(r, 20.0), {}, "the stage stays at 20 mm in stage.csv", 1),
+        (lambda r: with_stage_at(r, 180.0, 40), {}, "to 180 mm at 0.400 s in stage.csv; remove", 1),
+        (lambda r: r.corrected(replace(NARROW, name="other")), {}, "of config_3 and reconstr", 1),
+        # In another turn of the camera's clock, and in the host's time.
+        (lambda r: with_stage(r, (4 << 24) + 6_000_000), {}, "have no stage position; give the", 0),
+        (lambda r: with_stage(r, 10**8 << 24), {}, "have no stage position; give the stage log", 0),
+        (with_broken_words, {}, "are not as EVT3 has them", 0),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
         (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),
         (lambda r: r, {"range_min": 3.0}, "of the events are outside the limits of columns and", 0),
@@ -92,3 +116,20 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
     result = reconstruct_recording(change(recording), Settings(**settings))
     assert (len(result.points) > 0) == points
     assert sum(words in line for line in result.warnings) == 1, result.warnings
+
+
+def test_words_that_are_none_have_one_reason(recording):
+    """Counts of a stream that cannot be read are not explained one by one."""
+    lines = reconstruct_recording(with_broken_words(recording)).warnings
+    assert not [line for line in lines if "follow the laser" in line or "periods_per" in line]
+
+
+def test_what_no_setting_can_mend_is_an_error(recording):
+    with pytest.raises(CalibrationError, match="of 96 x 720 and config_3 of one of 96 x 480; give"):
+        reconstruct_recording(replace(recording, calibration=replace(NARROW, rows=480)))
+    samples = recording.stage_samples[:80].copy()
+    samples["t_us"] //= 1000
+    track = StageTrack()
+    track.append(samples["t_us"], samples["position_mm"])
+    with pytest.raises(FormatError, match="moves at 50 m/s; write t_us in microseconds"):
+        reconstruct_recording(replace(recording, stage=track, stage_samples=samples))

@@ -74,6 +74,7 @@ def test_a_header_or_events_alone_are_a_warning(tmp_path: Path, content: bytes, 
     [
         (b"", "empty"),
         (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "no RAW header"),
+        (b"\x1f\x8b" + bytes(99), "gzip; run gunzip on it"),
         (b"% evt 2.0\n% end\n", "EVT2, not EVT3"),
         (b"% evt 2.1\n% end\n", "EVT21, not EVT3"),
         (b"% format EVT21;height=720;width=1280\n% end\n", "EVT21, not EVT3"),

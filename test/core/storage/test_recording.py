@@ -48,6 +48,17 @@ def test_a_complete_folder(folder):
     assert np.isnan(recording.stage.position_mm([-1, 3001])).all()
 
 
+def test_given_values_stand_in_for_missing_files(folder):
+    (folder / "calibration.yaml").unlink()
+    (folder / "laser.yaml").unlink()
+    recording = load_recording(folder, load_calibration("config_1"), 300.0)
+    assert recording.calibration == load_calibration("config_1")
+    assert recording.modulation == Modulation(300.0)
+    (folder / "events.raw").rename(folder / "events.raw.gz")
+    with pytest.raises(FormatError, match="events.raw is missing; run gunzip on events.raw.gz"):
+        load_recording(folder)
+
+
 def test_layout_of_the_written_files(folder):
     assert (folder / "stage.csv").read_text() == (
         "t_us,position_mm\n0,0.000000\n1000,0.050000\n3000,0.150000\n"
