@@ -73,7 +73,7 @@ def table(title: str, *columns: str) -> Table:
 
     made = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
     for index, column in enumerate(columns):
-        made.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)
+        made.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
     return made
 
 

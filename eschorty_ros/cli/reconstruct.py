@@ -68,7 +68,7 @@ def setting_options() -> list[click.Parameter]:
     metavar="RECORDING...",
     nargs=-1,
     required=True,
-    type=click.Path(exists=True, path_type=Path),
+    type=click.Path(path_type=Path),
 )
 @click.option(
     "--out",

@@ -55,7 +55,7 @@ def command(
     """Draw CLOUD (.pcd or .ply): depth map along the line and the stage, and a 3-D view.
 
     A cloud of another program needs x, y and z, in metres, and open3d to read it; drawn are a
-    view along x and a 3-D view. All proportions are true. A page in the browser is served until
+    view along x and a 3-D view, in true proportions. A page in the browser is served until
     Ctrl-C, on this computer only unless --host says otherwise.
 
     \b

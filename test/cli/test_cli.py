@@ -112,7 +112,7 @@ def test_help_imports_nothing_heavy():
     [
         ("nonsense",),
         ("reconstruct",),
-        ("reconstruct", "/nowhere"),
+        ("info", "/nowhere"),
         ("simulate", "--frequency", "fast", "--out", "x"),
         ("design", "--theta-prime-deg", "-7", "--far-mm", "2000"),
         ("view", __file__, "--browser", "--out", "x.png"),

@@ -191,6 +191,8 @@ def load_recording(
         One line naming the file, the fault and the remedy.
     """
     folder = file_path("path", path)
+    if not folder.exists():
+        raise FormatError(f"{folder} does not exist; give a recording folder; {RAW_ALONE}")
     if not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; give a recording folder; {RAW_ALONE}")
     given = {CALIBRATION_FILE: calibration, LASER_FILE: frequency_hz}

@@ -19,6 +19,7 @@ from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 PACKETS_EXPECTED_S = 5.0
 """Time from the node's start after which a camera without packets is a warning."""
+_REMINDER_S = 30.0
 
 
 class Reports:
@@ -98,5 +99,10 @@ class Reports:
             return diagnostics.WARN, "; ".join(warnings), values
         if not stream.packets:
             late = time.monotonic() > self._begun_s + PACKETS_EXPECTED_S
+            if late:
+                self._node.get_logger().warning(
+                    "no packets on camera/events yet; check the camera's node and the topic",
+                    throttle_duration_sec=_REMINDER_S,
+                )
             return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values
         return diagnostics.OK, "reconstructing", values

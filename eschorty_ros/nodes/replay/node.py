@@ -117,6 +117,15 @@ class ReplayNode(Node):
 
     def _play(self) -> None:
         self._await_reconstruction()
+        from eschorty_ros.core.reconstruction import Settings
+
+        usual = Settings()
+        recorded = self._recording.settings.items()
+        if unusual := [f"{k} {v}" for k, v in recorded if v != getattr(usual, k, v)]:
+            self.get_logger().info(
+                f"recorded with {', '.join(unusual)}; for the same points the reconstruction needs "
+                "these parameters, which replay.launch.py sets"
+            )
         name = f"replay-{Path(self.parameters['recording']).resolve().name}"
         scan, position_mm = self._recording.scan, self._recording.stage_samples["position_mm"]
         start_mm, stop_mm = float(position_mm.min()), float(position_mm.max())
@@ -170,8 +179,10 @@ class ReplayNode(Node):
         )
         for end in self.get_subscriptions_info_by_topic(self._events.topic_name):
             if end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
+                name = "a node" if end.node_name.startswith("_") else end.node_name
                 self.get_logger().warning(
-                    f"{end.node_name} subscribes to camera/events best effort and may lose packets"
+                    f"{name} subscribes to camera/events best effort and may lose packets; make "
+                    "its subscription reliable"
                 )
 
     def _publish_clock(self) -> None:

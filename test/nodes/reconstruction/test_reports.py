@@ -39,7 +39,12 @@ def test_a_warning_of_the_reconstruction_is_the_line_of_the_diagnostics(lost):
 
 def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
-    reports = Reports(SimpleNamespace(create_publisher=lambda *_: None), pipeline, JobQueue(1))
+    logged = []
+    logger = SimpleNamespace(warning=lambda line, **_: logged.append(line))
+    node = SimpleNamespace(create_publisher=lambda *_: None, get_logger=lambda: logger)
+    reports = Reports(node, pipeline, JobQueue(1))
     assert reports.diagnose()[:2] == (diagnostics.OK, "no packets yet")
+    assert not logged
     monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.0)
     assert reports.diagnose()[:2] == (diagnostics.WARN, "no packets yet")
+    assert "no packets on camera/events" in logged[0]
