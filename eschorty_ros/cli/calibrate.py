@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar, show, table
-from eschorty_ros.cli.files import OUT_FILE
+from eschorty_ros.cli.files import OUT_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import Number, refuse_given
 from eschorty_ros.core.base.errors import FitError
@@ -307,6 +307,7 @@ def _finish(report: CalibrationReport, made_with: Mapping[str, str], out: Path) 
     # Last, so that an old one stays where the page has no room.
     with atomic_write(out.with_suffix(".html")) as stream:
         stream.write(page.encode())
+    report_replaced(out)
     save_calibration(report.calibration, out)
     _show(report)
     click.echo(str(out))

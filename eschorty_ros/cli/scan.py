@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
-from eschorty_ros.cli.files import IN_FILE
+from eschorty_ros.cli.files import IN_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, sweep_options
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
@@ -137,6 +137,7 @@ def command(
         load_viser()
         open_when_served(host, port)
         click.echo(f"page at http://{host}:{port}", err=True)
+    report_replaced(out / "scan.pcd")
     with _made(out, record), ended_by_signals(), progress_bar("scanning") as feedback:
         out.mkdir(parents=True, exist_ok=True)
         check_writable(out / "scan.pcd")

@@ -12,6 +12,7 @@ from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import between
 
 _PIECE_BYTES = 1 << 23
 # So many events of a chunk show what all do.
@@ -140,6 +141,9 @@ def _stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"after that; where these were scanned, too, {name} is cut: copy it again"
         )
     before = position_mm[: np.searchsorted(t_us, begin_us - _LEFT_US)]
+    if (scan := recording.scan) is not None:
+        # The stage has run up to the sweep before its events.
+        before = before[between(before, scan.start_mm, scan.stop_mm)]
     around = position_mm[slice(*np.searchsorted(t_us, (begin_us - _LEFT_US, begin_us + _LEFT_US)))]
     under_way = around.size > 1 and np.ptp(around) > _REST_MM
     if before.size and np.ptp(before) > least_mm and under_way:
