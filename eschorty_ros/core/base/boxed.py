@@ -6,6 +6,7 @@ there are a hundred of them. Boxed arrays are taken apart once.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 from numba import types
@@ -24,7 +25,7 @@ class Boxed(structref.StructRefProxy):
 
     def __new__(cls, content: Any) -> Boxed:
         """Return ``content`` boxed."""
-        boxed: Boxed = _boxed(content)
+        boxed: Boxed = _box()(content)
         return boxed
 
 
@@ -32,6 +33,12 @@ structref.define_boxing(_BoxedType, Boxed)
 structref.define_constructor(Boxed, _BoxedType, ["content"])
 
 
-@kernel
-def _boxed(content):
-    return Boxed(content)
+@cache
+def _box() -> Any:
+    """Return the kernel that boxes; made late, as its cache refers to the types of all contents."""
+
+    @kernel
+    def boxed(content):
+        return Boxed(content)
+
+    return boxed

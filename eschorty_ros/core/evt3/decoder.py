@@ -66,7 +66,8 @@ class Decoder:
         self.reset()
 
     def _use(self, memory: DecoderMemory) -> None:
-        self._memory, self._boxed = memory, Boxed(memory)
+        self._memory: DecoderMemory = memory
+        self._boxed: Boxed | None = None
 
     def reset(self) -> None:
         """Drop state and counters."""
@@ -169,6 +170,8 @@ class Decoder:
     @property
     def boxed(self) -> Boxed:
         """The memory as one argument."""
+        if self._boxed is None:
+            self._boxed = Boxed(self._memory)
         return self._boxed
 
     def words(self, data: Bytes) -> NDArray[np.uint16]:

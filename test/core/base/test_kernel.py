@@ -93,3 +93,22 @@ def _scaled(x):
     (tmp_path / "below.py").write_text(code)
     call = "try:\n    import below\nexcept NameError as error:\n    print(error)"
     assert output(tmp_path, "-c", call) == "_total uses _scaled; define it above\n"
+
+
+def test_boxed_arrays_are_compiled_once():
+    """The kernel's cache refers to types of modules that import it, so that it is read late."""
+    code = """
+import eschorty_ros as es
+from eschorty_ros.core.base.boxed import _box
+from eschorty_ros.core.evt3 import Decoder
+
+es.Reconstructor(es.load_calibration("config_3"), es.Modulation(70.0))
+Decoder().boxed
+print(len(_box().stats.cache_misses))
+"""
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    results = [
+        subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2)
+    ]
+    assert results[1].stdout == "0\n", results[1].stderr
