@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.console import progress_bar, show, table
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 from eschorty_ros.cli.options import Number
 
@@ -52,7 +52,8 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
     target = out or cloud.with_name(f"{cloud.stem}_mesh.ply")
     check_format(target)
     check_writable(target)
-    made = mesh(read_cloud(cloud), sigmas)
+    with progress_bar("meshing"):
+        made = mesh(read_cloud(cloud), sigmas)
     write_mesh(target, made)
     figures.save(mesh_figure(made, sigmas, cloud.name), target.with_suffix(".png"))
     if as_json:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.console import progress_bar, show, table
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 from eschorty_ros.cli.options import Number
 
@@ -74,12 +74,14 @@ def command(
     check_writable(out)
     parts = [read_cloud(path) for path in clouds]
     joined, poses, sizes = parts[0], [], [len(parts[0])]
-    for number, part in enumerate(parts[1:]):
-        start = pose_matrix(starts[number]) if number < len(starts) else None
-        pose = register(joined, part, start, reach_mm)
-        joined = join(joined, part, pose)
-        poses.append(pose)
-        sizes.append(len(part))
+    with progress_bar("registering") as report:
+        for number, part in enumerate(parts[1:]):
+            report(number / (len(parts) - 1), clouds[number + 1].name)
+            start = pose_matrix(starts[number]) if number < len(starts) else None
+            pose = register(joined, part, start, reach_mm)
+            joined = join(joined, part, pose)
+            poses.append(pose)
+            sizes.append(len(part))
     write_cloud(out, joined)
     figures.save(joined_figure(joined, sizes, str(out)), out.with_suffix(".png"))
     if as_json:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eschorty_ros.cli.console import progress_bar
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import page_options, refuse_given
@@ -146,7 +147,8 @@ def _draw_growing(points: Points, own: bool, target: Path) -> None:
 
     if not own:
         raise FormatError(f"{target} needs times and columns; give a cloud of this package")
-    write_growing_scan(points, target)
+    with progress_bar("drawing") as report:
+        write_growing_scan(points, target, lambda done, total: report(done / total, ""))
 
 
 def _read_other(cloud: Path) -> Points:

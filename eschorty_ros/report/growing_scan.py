@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +36,16 @@ class _Surface(NamedTuple):
     profile: NDArray[np.int64]
 
 
-def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -> None:
+def write_growing_scan(
+    points: NDArray[np.void],
+    path: str | os.PathLike[str],
+    progress: Callable[[int, int], Any] | None = None,
+) -> None:
     """Write a GIF of the cloud: profile by profile as the stage moves, then from both sides.
 
     - ``points``: POINT_DTYPE, shape (n,).
     - ``path``: Ends in ``.gif``.
+    - ``progress``: Called with frames drawn so far and frames in all.
 
     Raises ``ArgumentError`` when the cloud has less than two profiles or columns, or the path
     cannot be written.
@@ -48,13 +54,17 @@ def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -
 
     surface = _surface(points)
     last = int(surface.profile.max())
-    growing = [
-        _frame(surface, round(last * share), TURN_DEG * (share - 1.0) * 0.5)
+    views: list[tuple[int | None, float]] = [
+        (round(last * share), TURN_DEG * (share - 1.0) * 0.5)
         for share in np.linspace(0.0, 1.0, GROWING_FRAMES)
     ]
     phase = np.linspace(0.0, 2.0 * np.pi, TURNING_FRAMES, endpoint=False)
-    turning = [_frame(surface, None, TURN_DEG * np.sin(angle)) for angle in phase]
-    images = [Image.fromarray(frame) for frame in (*growing, *turning)]
+    views += [(None, TURN_DEG * np.sin(angle)) for angle in phase]
+    images = []
+    for view in views:
+        images.append(Image.fromarray(_frame(surface, *view)))
+        if progress is not None:
+            progress(len(images), len(views))
     # One palette for all frames: that of a frame with every colour.
     palette = images[GROWING_FRAMES * 3 // 4].quantize(COLOURS)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)

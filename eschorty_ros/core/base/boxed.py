@@ -38,7 +38,7 @@ def _box() -> Any:
     """Return the kernel that boxes; made late, as its cache refers to the types of all contents."""
 
     @kernel
-    def boxed(content):
+    def _boxed(content):
         return Boxed(content)
 
-    return boxed
+    return _boxed

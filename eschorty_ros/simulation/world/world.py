@@ -56,6 +56,7 @@ class World:
     - ``parameters``: Pixels under the factory's biases.
     - ``seed``: Fixes thresholds, jitter and background.
     - ``background_hz``: Background events per pixel and second.
+    - ``readout``: Replaces that of ``effects``.
 
     Public attributes:
     - ``trigger_input``: Source of edges at the camera's trigger input; called once for every piece
@@ -69,6 +70,7 @@ class World:
         parameters: PixelParameters | None = None,
         seed: int = 0,
         background_hz: float = BACKGROUND_HZ,
+        readout: ReadoutParameters | None = None,
         effects: Effects | None = None,
     ) -> None:
         effects = effects or Effects()
@@ -81,7 +83,8 @@ class World:
         self._factory = effects.pixels(parameters, self.model)
         background_hz *= self._factory.background_intensity / parameters.background_intensity
         self._pixels = PixelArray(self.columns, self.rows, self._factory, seed, background_hz)
-        self._readout = Readout(self.rows, ReadoutParameters(effects.row_time_us))
+        readout = readout or ReadoutParameters(effects.row_time_us)
+        self._readout = Readout(self.rows, readout)
         self._encoder = Encoder(self.columns, self.rows)
         self._laser = LaserTimeline()
         self._stage = StageTimeline()

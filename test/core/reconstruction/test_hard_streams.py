@@ -462,7 +462,7 @@ def _with_other_words(words):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (_without_a_part, "time jumps forward 1 times: events are missing there"),
+        (_without_a_part, "time jumps forward once: events are missing there"),
         (_with_other_words, "words of the events are not as EVT3 has them"),
     ],
 )
