@@ -332,11 +332,10 @@ def _show(report: CalibrationReport) -> None:
     show(made)
     for left_out in report.rejected:
         click.echo(f"rejected: {left_out.label}: {left_out.reason}")
-    reservations = [line for line in report.verdicts if line != "identifiable"]
-    known = "identifiable" if "identifiable" in report.verdicts else "not identifiable"
-    count = "1 reservation" if len(reservations) == 1 else f"{len(reservations)} reservations"
-    click.echo(f"verdict: {known}, {count}")
-    for line in reservations:
+    known = "identifiable" if report.identifiable else "not identifiable"
+    plural = "" if len(report.reservations) == 1 else "s"
+    click.echo(f"verdict: {known}, {len(report.reservations)} reservation{plural}")
+    for line in report.reservations:
         click.echo(f"verdict: {line}")
 
 

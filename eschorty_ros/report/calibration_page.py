@@ -73,8 +73,6 @@ def calibration_html(report: CalibrationReport, made_with: Mapping[str, str]) ->
         report=report,
         fit=fit,
         made_with=made_with,
-        good=[line for line in report.verdicts if line == "identifiable"],
-        reservations=[line for line in report.verdicts if line != "identifiable"],
         parameters=parameters(report),
         facts=_facts(report),
         pictures=[_picture(draw(report), caption) for draw, caption in _FIGURES],

@@ -54,6 +54,10 @@ def test_targets_become_a_calibration_and_a_page(targets_csv, tmp_path):
     assert done.exit_code == 0, done.output
     assert "rejected: line 5: row" in done.output
     assert "verdict: extrapolates outside 820 to 2050 mm" in done.output
+    assert "verdict: not identifiable, 3 reservations" in done.output
+    assert done.output.count("verdict: ") == 4
+    assert "is replaced" not in done.stderr
+    assert "made.yaml of 2" in run(targets_csv, "--nominal", "config_3", "--out", out).stderr
     made = load_calibration(out)
     assert np.abs(range_error_mm(made.model())).max() < 3.0
     assert abs(made.k_mm - TRUTH.k_mm) < 3.0 * np.sqrt(made.covariance[0][0]) < 0.3

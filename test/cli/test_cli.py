@@ -20,7 +20,7 @@ from waiting import wait_until
 
 from eschorty_ros import __version__
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
-from eschorty_ros.cli.console import progress_bar
+from eschorty_ros.cli.console import progress_bar, table
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
 
@@ -456,3 +456,14 @@ def test_a_bad_recording_does_not_end_the_others(recording, tmp_path, where):
     for folder in (folders[0], folders[2]):
         assert facts[folder]["points"] > 0
         assert (folder / "cloud.pcd").read_bytes() == expected
+
+
+def test_a_narrow_terminal_cuts_no_number():
+    from rich.console import Console
+
+    made = table("distances", *("name", *"abcde"))
+    made.add_row("surface 1", *["-1320.017 ± 0.123"] * 5)
+    console = Console(file=io.StringIO(), width=80)
+    console.print(made)
+    text = console.file.getvalue()
+    assert ("…" in text, text.count("-1320.017")) == (False, 5)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.diagnostics import (
+    IDENTIFIABLE,
     LISTED,
     KProfile,
     k_profile,
@@ -85,6 +86,16 @@ class CalibrationReport:
     """Posterior over prior standard deviation."""
     verdicts: tuple[str, ...]
     """``identifiable`` where it applies, then every reservation."""
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the targets determine the build."""
+        return IDENTIFIABLE in self.verdicts
+
+    @property
+    def reservations(self) -> list[str]:
+        """The other verdicts."""
+        return [line for line in self.verdicts if line != IDENTIFIABLE]
 
     @property
     def residual_mm(self) -> Array:

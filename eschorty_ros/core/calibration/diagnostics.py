@@ -20,6 +20,8 @@ from eschorty_ros.core.calibration.residuals import COLUMN_TERMS, WIDTH_BIAS, Ob
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
+IDENTIFIABLE = "identifiable"
+"""Verdict where the targets determine the build."""
 LISTED = 4
 """Targets that a verdict names."""
 # Above this ratio of standard deviations a prior determines more than the targets.
@@ -121,7 +123,7 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
     held = {name: ratio for name, ratio in ratios.items() if ratio > _PRIOR_SHARE}
     lines = []
     if found.condition_number <= CONDITION_WARNING and found.dof > 0 and not held:
-        lines.append("identifiable")
+        lines.append(IDENTIFIABLE)
     lines += found.verdicts
     for name, ratio in held.items():
         lines.append(

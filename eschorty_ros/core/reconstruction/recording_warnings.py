@@ -78,6 +78,11 @@ def recording_warnings(
     if span_us is None:
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
     stated_hz = recording.modulation.frequency_hz
+    if recording.calibration_replaced:
+        found.append(
+            f"the recording is of {recording.calibration_replaced} and reconstructed with "
+            f"{recording.calibration.name}; check that this is its instrument"
+        )
     samples = recording.stage_samples
     found += _stage_faults(recording, span_us)
     if shown_hz is not None and shown_hz != stated_hz:
@@ -116,11 +121,6 @@ def _stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
         found.append(
             f"the stage stays at {position_mm[0]:.6g} mm in stage.csv: all profiles are in one "
             "place; where it moved, give its positions"
-        )
-    if recording.calibration_replaced:
-        found.append(
-            f"the recording is of {recording.calibration_replaced} and reconstructed with "
-            f"{recording.calibration.name}; check that this is its instrument"
         )
     speed_mm_s = np.abs(np.diff(position_mm)) / np.diff(t_us) * 1e6
     jump = int(np.argmax(speed_mm_s)) if t_us.size > 1 else 0

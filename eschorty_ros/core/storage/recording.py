@@ -149,9 +149,9 @@ class Recording:
         modulation = self.modulation
         if frequency_hz is not None:
             modulation = replace(modulation, frequency_hz=frequency_hz)
-        own = self.calibration
-        given = calibration or own
-        replaced = own.name if given.name != own.name else self.calibration_replaced
+        given = calibration or self.calibration
+        recorded = self.calibration_replaced or self.calibration.name
+        replaced = recorded if given.name != recorded else ""
         return replace(
             self, calibration=given, modulation=modulation, calibration_replaced=replaced
         )

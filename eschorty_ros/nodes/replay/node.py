@@ -21,6 +21,7 @@ from sensor_msgs.msg import TimeReference
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.clocks import NS_PER_US
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import Recording, load_recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.live.device_messages import ns_from_stamp
@@ -117,8 +118,6 @@ class ReplayNode(Node):
 
     def _play(self) -> None:
         self._await_reconstruction()
-        from eschorty_ros.core.reconstruction import Settings
-
         usual = Settings()
         recorded = self._recording.settings.items()
         if unusual := [f"{k} {v}" for k, v in recorded if v != getattr(usual, k, v)]:

@@ -82,10 +82,11 @@ def live(tmp_path_factory):
 
 
 def replay(recording, rate, domain):
-    """Replay a recording to its end."""
+    """Replay a recording to its end; return what it logged."""
     parameters = {"recording": recording.path, "rate": rate, "timeout": DEADLINE_S}
     with NodeProcess(NODES.format("replay"), parameters, domain=domain) as process:
         assert process.wait() == 0, process.output
+        return process.output
 
 
 def assert_same_points(cloud, expected):
@@ -200,9 +201,10 @@ def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
         Observer(domain) as observer,
     ):
         clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
-        replay(recording, 0.0, domain)
+        output = replay(recording, 0.0, domain)
         wait_until(lambda: clouds, "scan/points")
         points = points_from_message(clouds[-1])
+    assert "recorded with trigger_source none, smoothing_half_width 3; for the same" in output
     assert len(points) == len(expected) > 500
     for name in ("x", "y", "z", "sigma", "column"):
         np.testing.assert_array_equal(points[name], expected[name], err_msg=name)
