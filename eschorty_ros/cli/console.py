@@ -66,6 +66,11 @@ def progress_bar(title: str) -> Iterator[Report]:
         ended.set()
 
 
+def warn(text: str) -> None:
+    """Print a warning on stderr."""
+    print(f"eschorty: warning: {text}", file=sys.stderr, flush=True)
+
+
 def table(title: str, *columns: str) -> Table:
     """Return an empty table; the first column is left aligned, the others right."""
     from rich import box

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from eschorty_ros.cli.console import progress_bar
+from eschorty_ros.cli.console import progress_bar, warn
 from eschorty_ros.cli.options import recorded_options, refuse_given
 
 STORAGES = ("mcap", "sqlite3")
@@ -77,4 +77,4 @@ def recording_of(
     build = None if calibration is None else load_calibration(calibration)
     lacking = bag_to_recording(bag, folder, build, frequency, settings, 1e-3 * packet_period_ms)
     if lacking:
-        click.echo(f"eschorty: warning: {lacking}", err=True)
+        warn(lacking)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.console import pairs, progress_bar, warn
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,6 +38,7 @@ def command(path: Path) -> None:
       eschorty info scan/scan.pcd
     """  # noqa: D301
     from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
     from eschorty_ros.core.storage import (
         LASER_FILE,
         TRUTH_FILE,
@@ -66,7 +67,8 @@ def command(path: Path) -> None:
         if recording.scan is not None:
             rows |= _scan(recording.scan)
         pairs(str(path), rows | _truth(recording.truth))
-        _raw(recording.events_path)
+        for fault in stage_faults(recording, _raw(recording.events_path)):
+            warn(fault)
     elif path.suffix in (".pcd", ".ply"):
         _cloud(path)
     elif path.name == LASER_FILE:
@@ -165,7 +167,8 @@ def _cloud(path: Path) -> None:
     pairs(str(path), rows)
 
 
-def _raw(path: Path) -> None:
+def _raw(path: Path) -> tuple[int, int]:
+    """Show a file of the camera's bytes; return the sensor times of its first and last event."""
     import numpy as np
 
     from eschorty_ros.core.evt3 import Decoder
@@ -215,4 +218,5 @@ def _raw(path: Path) -> None:
     }
     pairs(str(path), rows)
     for warning in reader.warnings:
-        click.echo(f"eschorty: warning: {warning}", err=True)
+        warn(warning)
+    return first_us, last_us

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.console import show, table, warn
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 from eschorty_ros.cli.options import Number
 from eschorty_ros.surfaces.plane import COMMON_SHARE
@@ -140,10 +140,9 @@ def _print(measured: Measured, title: str) -> None:
     show(first)
     bent = [str(n) for n, surface in enumerate(measured.surfaces, 1) if surface.flat.of_no_plane]
     if bent:
-        click.echo(
-            f"eschorty: warning: no plane: {', '.join(bent)}, by flatness; slopes, distances and "
-            "angles are those of the plane that fits best; choose parts with --region",
-            err=True,
+        warn(
+            f"no plane: {', '.join(bent)}, by flatness; slopes, distances and angles are those of "
+            "the plane that fits best; choose parts with --region"
         )
     if measured.pairs:
         second = table("", "to surface 1", "distance mm", "angle °", "flush mm", "gap mm")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.cluster import on_cluster
-from eschorty_ros.cli.console import Report, accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.console import Report, accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
@@ -273,7 +273,7 @@ def _print(
 
     name = "" if recording is None else f"{recording}: "
     for warning in facts["warnings"]:
-        click.echo(f"eschorty: warning: {name}{warning}", err=True)
+        warn(f"{name}{warning}")
     if as_json:
         first = {} if recording is None else {"recording": str(recording)}
         if measured is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, sweep_options
@@ -221,7 +221,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
             columns = (known[name] for name in ("t_us", "column", "range_mm"))
             write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
         except EschortyError as error:
-            click.echo(f"eschorty: warning: the recording has no truth: {error}", err=True)
+            warn(f"the recording has no truth: {error}")
 
 
 def _print(result: ScanResult, rows: dict[str, str], out: Path) -> None:
@@ -239,4 +239,4 @@ def _print(result: ScanResult, rows: dict[str, str], out: Path) -> None:
         },
     )
     if result.message:
-        click.echo(f"eschorty: warning: {result.message}", err=True)
+        warn(result.message)

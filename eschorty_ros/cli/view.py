@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import progress_bar
+from eschorty_ros.cli.console import progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import page_options, refuse_given
@@ -183,7 +183,7 @@ def _drawable(points: Points, cloud: Path) -> Points:
         )
     if not good.all():
         left_out = f"{np.count_nonzero(~good):,} of {len(points):,} points"
-        click.echo(f"eschorty: warning: {left_out} are not finite or beyond bounds", err=True)
+        warn(f"{left_out} are not finite or beyond bounds")
     return points[good]
 
 

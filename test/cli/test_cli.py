@@ -280,6 +280,17 @@ def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     assert "peak rate" in good("info", recording / "events.raw")
 
 
+def test_info_warns_of_a_recording_that_is_cut(recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "rec")
+    data = (recording / "events.raw").read_bytes()
+    (tmp_path / "rec" / "events.raw").write_bytes(data[: len(data) // 16 * 2])
+    done = run("info", tmp_path / "rec")
+    assert done.exit_code == 0
+    assert "the stage moves" in done.stderr
+    assert "events.raw is cut: copy it again" in done.stderr
+    assert not run("info", recording).stderr
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -84,7 +84,7 @@ def recording_warnings(
             f"{recording.calibration.name}; check that this is its instrument"
         )
     samples = recording.stage_samples
-    found += _stage_faults(recording, span_us)
+    found += stage_faults(recording, span_us)
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
@@ -108,8 +108,11 @@ def recording_warnings(
     return [*found, *_few_points(settings, counters, points, dark, shown_hz is not None)]
 
 
-def _stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
-    """Return one line for each contradiction between the stage's positions and the events' time."""
+def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
+    """Return one line for each contradiction between the stage's positions and the events' time.
+
+    - ``span_us``: Sensor times of the first and the last event.
+    """
     t_us, position_mm = (recording.stage_samples[name] for name in ("t_us", "position_mm"))
     found, name = [], recording.events_path.name
     way_mm = float(np.ptp(position_mm))
