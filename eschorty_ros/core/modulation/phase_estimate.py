@@ -13,8 +13,8 @@ from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation.modulation import Modulation
 
-WINDOW_PERIODS = 4
-WINDOW_EVENTS = 2048
+_WINDOW_PERIODS = 4
+_WINDOW_EVENTS = 2048
 _HISTOGRAM_BINS = 200
 # A readout that takes one row after the other may leave so long without an event in a burst, and
 # so many bins are taken as such at most: noise fills some.
@@ -108,14 +108,14 @@ def estimation_window(
 ) -> Window | None:
     """Return the first estimation window of ``t_us``, ``None`` while it is still open.
 
-    A window begins at the first event; it is the least multiple of ``WINDOW_PERIODS`` periods with
-    ``WINDOW_EVENTS`` events. It depends on the events alone, not on the time of their arrival.
+    A window begins at the first event; it is the least multiple of ``_WINDOW_PERIODS`` periods with
+    ``_WINDOW_EVENTS`` events. It depends on the events alone, not on the time of their arrival.
     """
-    if t_us.size < WINDOW_EVENTS:
+    if t_us.size < _WINDOW_EVENTS:
         return None
-    span_us = WINDOW_PERIODS * modulation.period_us
+    span_us = _WINDOW_PERIODS * modulation.period_us
     first = int(t_us[0])
-    pieces = int((int(t_us[WINDOW_EVENTS - 1]) - first) / span_us) + 1
+    pieces = int((int(t_us[_WINDOW_EVENTS - 1]) - first) / span_us) + 1
     end_us = first + round(pieces * span_us)
     if watermark_us <= end_us:
         return None
