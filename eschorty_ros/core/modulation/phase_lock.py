@@ -43,8 +43,7 @@ class PhaseLock:
     - ``every``: See ``EdgeSchedule``.
 
     Public attributes:
-    - ``missing``: True when the stream ended without a phase; periods then count from the first
-      event.
+    - ``missing``: True when the stream ended without a phase.
     """
 
     def __init__(self, modulation: Modulation, every: int = 1) -> None:
@@ -73,7 +72,8 @@ class PhaseLock:
     def find(self, held: HeldEvents, now_us: int, last: bool = False) -> bool:
         """Anchor the schedule as soon as the held events allow; return whether it is anchored.
 
-        Drops windows without a phase beyond the limit. ``last``: no more events come.
+        Drops windows without a phase beyond the limit; all of them where no more events come, with
+        ``last``.
         """
         if len(held) == 0:
             return False
@@ -107,8 +107,8 @@ class PhaseLock:
             if estimate.found:
                 return self._anchor(estimate, first_us)
             self.missing = True
-            self.schedule.anchor(first_us, first_us)
-        return last
+            held.refuse(len(held))
+        return False
 
     def _anchor(self, estimate: PhaseEstimate, first_us: int) -> bool:
         self.schedule.anchor(estimate.edge_us, first_us)

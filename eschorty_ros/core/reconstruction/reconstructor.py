@@ -171,8 +171,7 @@ class Reconstructor:
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
 
-        Without any phase until here the periods are cut from the first event's time on and
-        ``phase_missing`` is set.
+        Without any phase until here there are none, and ``phase_missing`` is set.
         """
         left, self._before_restart = self._before_restart, []
         self._periods.finish(self.newest_t_us)
@@ -332,7 +331,7 @@ class Reconstructor:
 
     @property
     def phase_missing(self) -> bool:
-        """True when a flush found no phase and cut from the first event's time on."""
+        """True when a flush found no phase in the events held back, and used none."""
         return self._periods.lock.missing
 
     @property
@@ -348,7 +347,8 @@ class Reconstructor:
         every, columns = self.periods_per_profile, self.model.columns
         if self.phase_missing:
             found.append(
-                "no modulation phase found in the events; periods are cut from the first event on"
+                f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
+                "of them is used"
             )
         found += stream_faults(counts)
         if is_unreadable(counts):

@@ -341,11 +341,12 @@ def test_noise_before_the_laser_is_kept_back_and_the_phase_still_found():
     assert np.count_nonzero(found.t_us > 500_000) > 0.98 * 8 * 1280
 
 
-def test_no_phase_is_said():
+def test_events_without_a_phase_give_nothing_and_are_counted():
     n = 3000
     found, reconstructor = reconstruct(encoded(sort_readout(*noise(n, 80_000))), Modulation(70.0))
     assert reconstructor.phase_missing
-    assert reconstructor.counters["events_binned"] == n
+    assert reconstructor.counters["events_outside_phase"] == n
+    assert any("no modulation at 70 Hz" in warning for warning in reconstructor.warnings)
     assert len(found) == 0
 
 
