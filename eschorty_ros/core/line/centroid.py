@@ -168,7 +168,7 @@ def _refine(column, at, window, line_variance, estimator, footprint, row_counts,
         windows.sigma2[at] = learned
         bias = 0.0
         bias2, less = _cut_bias2(row, variance, line_variance, sensor_rows)
-        if less or footprint.state.cut_computations > 0:
+        if less or footprint.state.all_cut > 0:
             # The footprint has no whole line, or no rows beyond the sensor. The part that is left
             # is off by so much, less what the footprint explains.
             bias = max(np.sqrt(bias2) - abs(reported - row), 0.0)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.estimators import _mean
 from eschorty_ros.core.line.line_history import _moves_fast
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
@@ -30,6 +31,14 @@ _SIDE = 2 * _PLACES
 # Before every row of a line on the sensor.
 _NOT_SAMPLED = -(1 << 20)
 _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uintp)
+# Places to either side of which lines that are all cut may have their centre, and places that are to
+# be seen on both sides of it.
+_CENTRES = 8 * _PLACES
+_BOTH_SIDES_MIN = 2 * _PLACES
+# Sum of squares over sum of the weights of near places, for the variance of their mean.
+_NEAR_PLACES = 5.4
+# Asymmetry that is more than chance.
+_BY_CHANCE = 1.5
 # Steps of a log-likelihood of one.
 _LOG_ONE = 64
 # The least log-likelihood of a row in steps, and the least of all rows, which fits 16 bits.
@@ -71,7 +80,7 @@ class Footprint(NamedTuple):
     learned rows of a profile differ from means.
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
-    since, and of the ``cut_computations`` from lines that are all cut; ``near_edge`` is 1 while the
+    since; ``all_cut`` is 1 where the last one is of lines that are all cut, ``near_edge`` while the
     sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in profiles of
     the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the sums of how
     much their rows scatter, in millionths of a row. ``choice`` is what followed from it, one of the
@@ -110,7 +119,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
             "profiles",
             "computations",
             "columns",
-            "cut_computations",
+            "all_cut",
             "near_edge",
             "trying",
             "trials",
@@ -135,8 +144,7 @@ def _restart_from(footprint, known):
     state, before = footprint.state, known.state
     state.profiles = state.columns = state.near_edge = state.trying = state.trials = 0
     state.scatter = state.scatter_learned = 0
-    state.computations = before.computations
-    state.cut_computations = before.cut_computations
+    state.computations, state.all_cut = before.computations, before.all_cut
     state.choice = before.choice
 
 
@@ -273,12 +281,75 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
     return mean, variance
 
 
+@kernel(_nrt=False)
+def _asymmetry(places, centre):
+    """Return the mean square difference of mean counts on either side of a centre.
+
+    It is 1 where chance makes them differ, and infinite where few places are seen on both sides.
+    """
+    pixels, mean, variance = places
+    squares, both = 0.0, 0
+    for b in range(1, min(centre, pixels.size - 1 - centre) + 1):
+        i, j = centre - b, centre + b
+        if min(pixels[i], pixels[j]) > 0.0:
+            difference = mean[i] - mean[j]
+            chance = variance[i] / pixels[i] + variance[j] / pixels[j]
+            squares += difference * difference / max(chance, 1e-9)
+            both += 1
+    return squares / both if both >= _BOTH_SIDES_MIN else np.inf
+
+
 @kernel
-def _compute(footprint):
-    """Compute the logarithms from the counts of pixels."""
+def _near_places(values):
+    """Return the sums of values over a row on either side, with weights that fall linearly."""
+    sums = np.zeros(values.size)
+    for b in range(values.size):
+        for near in range(max(b - _PLACES + 1, 0), min(b + _PLACES, values.size)):
+            sums[b] += (_PLACES - abs(b - near)) * values[near]
+    return sums
+
+
+@kernel
+def _centre(pixels):
+    """Return the place about which the mean counts by place are the most symmetric.
+
+    Rows of lines that are all cut are off by about as much: their footprint has its centre there,
+    and no places beyond the sensor. It is the middle where that is as symmetric as chance allows.
+    """
+    middle = pixels.shape[1] // 2
+    number, events, squares = np.zeros((3, pixels.shape[1]))
+    for k in range(pixels.shape[0]):
+        number += pixels[k]
+        events += k * pixels[k]
+        squares += k * k * pixels[k]
+    number = _near_places(number)
+    known = np.maximum(number, 1.0)
+    mean = _near_places(events) / known
+    variance = _near_places(squares) / known - mean * mean
+    places = number / _NEAR_PLACES, mean, variance
+    best, least = middle, 0.5 * _asymmetry(places, middle)
+    for centre in range(middle - _CENTRES, middle + _CENTRES + 1):
+        asymmetry = _asymmetry(places, centre)
+        if asymmetry < least and least > _BY_CHANCE:
+            best, least = centre, asymmetry
+    return best
+
+
+@kernel
+def _compute(footprint, whole):
+    """Compute the logarithms from the counts of pixels, of ``whole`` lines or of cut ones."""
     pixels, log, none = footprint.pixels, footprint.log, footprint.none
     size = pixels.shape[1]
     shares = pixels + pixels[:, ::-1]
+    if not whole:
+        middle, centre = size // 2, _centre(pixels)
+        for b in range(size):
+            at, mirrored = centre + b - middle, centre - b + middle
+            shares[:, b] = 0.0
+            if 0 <= at < size:
+                shares[:, b] += pixels[:, at]
+            if 0 <= mirrored < size:
+                shares[:, b] += pixels[:, mirrored]
     if shares.sum() == 0.0:
         return
     overall = shares.sum(axis=1) / shares.sum()
@@ -310,11 +381,13 @@ def _compute(footprint):
 
 
 @kernel(_nrt=True)
-def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
+def _learn(footprint, rows, smoothed, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
-    Columns in which the sensor's edge cuts the line count where they are the majority.
+    Columns in which the sensor's edge cuts the line count where they are the majority, at the
+    distances from their mean rows, which are all off by about as much.
     """
+    row, uncertain, truncated = rows.row[0], rows.uncertain[0], rows.truncated[0]
     state = footprint.state
     whole = 2 * np.count_nonzero(truncated) < np.count_nonzero(np.isfinite(row))
     pixels = footprint.pixels
@@ -329,7 +402,10 @@ def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
             continue
         first = max(-first_row, 0)
         last = min(2 * footprint.reach, sensor_rows - 1 - first_row)
-        begin = middle + np.int64(np.rint(_PLACES * (first_row - smoothed[c])))
+        line = smoothed[c]
+        if not whole:
+            line = _mean(rows.events[0, c], rows.windows.first[0, c], rows.windows.d[0, c])
+        begin = middle + np.int64(np.rint(_PLACES * (first_row - line)))
         for at in range(np.uintp(first), np.uintp(last + 1)):
             place = begin + np.int64(_PLACES * at)
             if 0 <= place <= 2 * middle:
@@ -337,14 +413,11 @@ def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
         state.columns += 1
     state.profiles += 1
     doublings = min(max(state.computations - _ROUNDS, 0), _DOUBLINGS)
-    columns = _COLUMNS_MIN << doublings
-    if not whole:
-        # More rounds: footprint and rows converge together.
-        columns = (_COLUMNS_MIN // 2) << min(state.cut_computations // 12, _DOUBLINGS)
-    if state.columns >= columns:
-        _compute(footprint)
-        state.cut_computations = 0 if whole else state.cut_computations + 1
-        pixels[:] = 0.0
+    if state.columns >= _COLUMNS_MIN << doublings:
+        _compute(footprint, whole)
+        state.all_cut = not whole
+        # Distances from mean rows do not depend on the footprint.
+        pixels *= 0.0 if whole else 0.5
         state.columns = 0
         state.trying = state.choice == UNDECIDED and state.computations >= _ROUNDS
 

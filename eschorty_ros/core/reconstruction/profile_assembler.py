@@ -114,7 +114,7 @@ class ProfileAssembler:
         self._memory.columns.counts[:] = 0
         known = self._memory.known.state
         known["choice"] = self._first_choice
-        known["computations"] = known["cut_computations"] = 0
+        known["computations"] = known["all_cut"] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
         self._memory.known_widths.number[:] = 0.0

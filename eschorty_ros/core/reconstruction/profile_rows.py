@@ -355,10 +355,7 @@ def _close(memory):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
-        uncertain, truncated = rows.uncertain[0], rows.truncated[0]
-        _learn(
-            footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
-        )
+        _learn(footprint, rows, smoothing.row[0], estimator.sensor_rows)
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
