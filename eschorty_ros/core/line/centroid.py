@@ -19,7 +19,13 @@ from eschorty_ros.core.line.estimators import (
     _median,
     _variance,
 )
-from eschorty_ros.core.line.learned import LEARNED_ROWS, MEAN_ROWS, _learned_row, _sample
+from eschorty_ros.core.line.learned import (
+    LEARNED_ROWS,
+    MEAN_ROWS,
+    _centre_error_px,
+    _learned_row,
+    _sample,
+)
 from eschorty_ros.core.line.sigma import _own_variance
 from eschorty_ros.core.line.window import (
     AMBIGUOUS,
@@ -172,6 +178,7 @@ def _refine(column, at, window, line_variance, estimator, footprint, row_counts,
             # The footprint has no whole line, or no rows beyond the sensor. The part that is left
             # is off by so much, less what the footprint explains.
             bias = max(np.sqrt(bias2) - abs(reported - row), 0.0)
+            bias = bias if less else min(bias, _centre_error_px(footprint))
         windows.common2[at] = bias * bias + (best - reported) ** 2
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.estimators import _mean
 from eschorty_ros.core.line.line_history import _moves_fast
-from eschorty_ros.core.line.scatter import _median_difference
+from eschorty_ros.core.line.scatter import _WHOLE, _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
 # Places per row.
@@ -31,14 +31,17 @@ _SIDE = 2 * _PLACES
 # Before every row of a line on the sensor.
 _NOT_SAMPLED = -(1 << 20)
 _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uintp)
-# Places to either side of which lines that are all cut may have their centre, and places that are to
-# be seen on both sides of it.
+# Places to either side where lines that are all cut may have their centre, and those that are to be
+# seen on both sides of it.
 _CENTRES = 8 * _PLACES
 _BOTH_SIDES_MIN = 2 * _PLACES
 # Sum of squares over sum of the weights of near places, for the variance of their mean.
 _NEAR_PLACES = 5.4
-# Asymmetry that is more than chance.
-_BY_CHANCE = 1.5
+# Variance over that by chance of counts that show a structure, the asymmetry of a centre, and its
+# largest error.
+_STRUCTURE_MIN = 4.0
+_SYMMETRIC = 0.1
+_ERROR_MAX = 2 * _PLACES
 # Steps of a log-likelihood of one.
 _LOG_ONE = 64
 # The least log-likelihood of a row in steps, and the least of all rows, which fits 16 bits.
@@ -80,8 +83,9 @@ class Footprint(NamedTuple):
     learned rows of a profile differ from means.
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
-    since; ``all_cut`` is 1 where the last one is of lines that are all cut, ``near_edge`` while the
-    sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in profiles of
+    since; ``all_cut`` is 1 where the last one is of lines that are all cut, whose centre may be so
+    many places ``away``; ``near_edge`` is 1 while the sensor's edge cuts a line, for which means
+    need a footprint, too. ``trying`` is 1 in profiles of
     the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the sums of how
     much their rows scatter, in millionths of a row. ``choice`` is what followed from it, one of the
     three below.
@@ -120,6 +124,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
             "computations",
             "columns",
             "all_cut",
+            "away",
             "near_edge",
             "trying",
             "trials",
@@ -144,7 +149,8 @@ def _restart_from(footprint, known):
     state, before = footprint.state, known.state
     state.profiles = state.columns = state.near_edge = state.trying = state.trials = 0
     state.scatter = state.scatter_learned = 0
-    state.computations, state.all_cut = before.computations, before.all_cut
+    state.computations = before.computations
+    state.all_cut, state.away = before.all_cut, before.away
     state.choice = before.choice
 
 
@@ -283,20 +289,29 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
 
 @kernel(_nrt=False)
 def _asymmetry(places, centre):
-    """Return the mean square difference of mean counts on either side of a centre.
+    """Return how different mean counts are on either side of a centre, over how much they vary.
 
-    It is 1 where chance makes them differ, and infinite where few places are seen on both sides.
+    It is 0 for a symmetric footprint, 1 for an unrelated one, and infinite where few places are
+    seen on both sides or counts vary no more there than by chance.
     """
     pixels, mean, variance = places
-    squares, both = 0.0, 0
-    for b in range(1, min(centre, pixels.size - 1 - centre) + 1):
+    reach = min(centre, pixels.size - 1 - centre)
+    total, both = 0.0, 0
+    for b in range(1, reach + 1):
+        if min(pixels[centre - b], pixels[centre + b]) > 0.0:
+            total += mean[centre - b] + mean[centre + b]
+            both += 1
+    if both < _BOTH_SIDES_MIN:
+        return np.inf
+    usual, differences, variations, chance = 0.5 * total / both, 0.0, 0.0, 0.0
+    for b in range(1, reach + 1):
         i, j = centre - b, centre + b
         if min(pixels[i], pixels[j]) > 0.0:
-            difference = mean[i] - mean[j]
-            chance = variance[i] / pixels[i] + variance[j] / pixels[j]
-            squares += difference * difference / max(chance, 1e-9)
-            both += 1
-    return squares / both if both >= _BOTH_SIDES_MIN else np.inf
+            weight = pixels[i] * pixels[j] / (pixels[i] + pixels[j])
+            differences += weight * (mean[i] - mean[j]) ** 2
+            variations += weight * ((mean[i] - usual) ** 2 + (mean[j] - usual) ** 2)
+            chance += weight * (variance[i] / pixels[i] + variance[j] / pixels[j])
+    return differences / variations if variations > _STRUCTURE_MIN * chance else np.inf
 
 
 @kernel
@@ -311,10 +326,11 @@ def _near_places(values):
 
 @kernel
 def _centre(pixels):
-    """Return the place about which the mean counts by place are the most symmetric.
+    """Return the place about which the mean counts by place are symmetric, and its error.
 
     Rows of lines that are all cut are off by about as much: their footprint has its centre there,
-    and no places beyond the sensor. It is the middle where that is as symmetric as chance allows.
+    and no places beyond the sensor. The error is the distance to the furthest symmetric place. It
+    is -1, and the centre the middle, where there are none or many.
     """
     middle = pixels.shape[1] // 2
     number, events, squares = np.zeros((3, pixels.shape[1]))
@@ -325,14 +341,26 @@ def _centre(pixels):
     number = _near_places(number)
     known = np.maximum(number, 1.0)
     mean = _near_places(events) / known
-    variance = _near_places(squares) / known - mean * mean
+    # Counts that are all the same vary by less than a whole one.
+    variance = _near_places(squares) / known - mean * mean + _WHOLE
     places = number / _NEAR_PLACES, mean, variance
-    best, least = middle, 0.5 * _asymmetry(places, middle)
-    for centre in range(middle - _CENTRES, middle + _CENTRES + 1):
+    best, least, error = middle, _SYMMETRIC, -1
+    tried = range(middle - _CENTRES, middle + _CENTRES + 1)
+    for centre in tried:
         asymmetry = _asymmetry(places, centre)
-        if asymmetry < least and least > _BY_CHANCE:
-            best, least = centre, asymmetry
-    return best
+        if asymmetry < least:
+            best, least, error = centre, asymmetry, 1
+    for centre in tried:
+        if error > 0 and _asymmetry(places, centre) < _SYMMETRIC:
+            error = max(error, abs(centre - best))
+    return (best, error) if error <= _ERROR_MAX else (middle, -1)
+
+
+@kernel(_nrt=False)
+def _centre_error_px(footprint):
+    """Return by how much the centre of lines that are all cut may be off, if it is known."""
+    away = footprint.state.away
+    return (away + 1) / _PLACES if away >= 0 else np.inf
 
 
 @kernel
@@ -342,7 +370,8 @@ def _compute(footprint, whole):
     size = pixels.shape[1]
     shares = pixels + pixels[:, ::-1]
     if not whole:
-        middle, centre = size // 2, _centre(pixels)
+        middle = size // 2
+        centre, footprint.state.away = _centre(pixels)
         for b in range(size):
             at, mirrored = centre + b - middle, centre - b + middle
             shares[:, b] = 0.0
@@ -384,19 +413,19 @@ def _compute(footprint, whole):
 def _learn(footprint, rows, smoothed, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
-    Columns in which the sensor's edge cuts the line count where they are the majority, at the
+    Columns in which the sensor's edge cuts the line count where few others are, alone and at the
     distances from their mean rows, which are all off by about as much.
     """
     row, uncertain, truncated = rows.row[0], rows.uncertain[0], rows.truncated[0]
     state = footprint.state
-    whole = 2 * np.count_nonzero(truncated) < np.count_nonzero(np.isfinite(row))
+    whole = 4 * np.count_nonzero(truncated) < 3 * np.count_nonzero(np.isfinite(row))
     pixels = footprint.pixels
     middle = pixels.shape[1] // 2
     for slot in range(footprint.first_row.size):
         first_row = footprint.first_row[slot]
         footprint.first_row[slot] = _NOT_SAMPLED
         c = slot * _STRIDE + state.profiles % _STRIDE
-        if first_row == _NOT_SAMPLED or c >= row.size or uncertain[c] or (whole and truncated[c]):
+        if first_row == _NOT_SAMPLED or c >= row.size or uncertain[c] or whole == truncated[c]:
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue

@@ -89,8 +89,8 @@ While the sensor's edge cuts a line learning goes on.
 _KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
 _WIDTH_MIN_DOF = 64
-# Times the limit that a line may be wide.
-_WIDER = 4
+# Times the limit that a line may be wide, and from which on that is a fault.
+_WIDER, _TOO_WIDE = 4, 1.5
 # Evenly filled windows measure 1.77 times their width, those of a line once: in the middle.
 _FILLED = np.sqrt(HALF_PER_SIGMA / FRACTION / np.sqrt(3.0))
 
@@ -324,7 +324,7 @@ def _close(memory):
     half = state.half
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
-    counters.profiles_too_wide += state.half > estimator.half_max
+    counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
     counters.columns_ambiguous += sums.ambiguous

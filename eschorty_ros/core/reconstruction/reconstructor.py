@@ -27,6 +27,7 @@ from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 from eschorty_ros.core.reconstruction.stream_faults import is_unreadable, stream_faults
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
+from eschorty_ros.core.storage import SENSOR_EDGE
 
 _PIECE_WORDS = 1 << 16
 # Few words more than a block of the phase lock needs events.
@@ -114,7 +115,7 @@ class Reconstructor:
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
-            points_flagged=0, columns_compensated=0,
+            points_flagged=0, points_cut=0, columns_compensated=0,
         )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
@@ -265,7 +266,11 @@ class Reconstructor:
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
             profiles = profiles.select(within)
-        self._counts["points_flagged"] += int(np.count_nonzero(profiles.flags))
+        flagged = int(np.count_nonzero(profiles.flags))
+        self._counts["points_flagged"] += flagged
+        if flagged:
+            cut = profiles.flags & SENSOR_EDGE
+            self._counts["points_cut"] += int(np.count_nonzero(cut))
         if self.settings.keep == "good":
             profiles = profiles.select(profiles.flags == 0)
         self._counts["points"] += len(profiles)
@@ -372,11 +377,17 @@ class Reconstructor:
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
                 "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
+        cut = counts["points_cut"]
+        if 2 * cut > points:
+            found.append(
+                f"the sensor's edge cuts the line in {cut / max(points, cut):.0%} of the points; "
+                "move the surface nearer to the middle of the ranges"
+            )
         if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
             found.append(
-                f"the line is wider than line_width_px = {self.settings.line_width_px:g} in "
-                f"{counts['profiles_too_wide']} of {counts['periods_closed']} profiles; raise it, "
-                "or focus the laser"
+                "the line is more than 1.5 times as wide as line_width_px = "
+                f"{self.settings.line_width_px:g} in {counts['profiles_too_wide']} of "
+                f"{counts['periods_closed']} profiles; focus the laser, or raise it"
             )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]
@@ -411,7 +422,8 @@ class Reconstructor:
         ``events_dropped``: without light there is no phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser.
-        ``points_flagged`` are some of ``points``, or with ``keep`` good left out.
+        ``points_flagged`` are some of ``points``, or with ``keep`` good left out; ``points_cut``,
+        by the sensor's edge, are some of those.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words``,
         ``broken_words`` and ``decoder_*`` come from the decoder.
         """

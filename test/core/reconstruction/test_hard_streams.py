@@ -279,7 +279,7 @@ def test_a_line_wider_than_the_limit_is_followed_with_a_warning():
     good = found.select((found.period >= 5) & (found.flags == 0))
     assert 0.6 < np.mean(np.abs(error_px(good)) < good.sigma_row) < 0.76
     (warning,) = reconstructor.warnings
-    assert "wider than line_width_px = 20" in warning
+    assert "1.5 times as wide as line_width_px = 20" in warning
 
 
 @pytest.mark.parametrize("line_width_px", [3.0, 5.0, 8.0])
@@ -290,7 +290,7 @@ def test_a_limit_far_below_the_line_is_exceeded_with_a_warning(line_width_px):
     error = error_px(found)[found.period >= 10]
     assert np.median(np.abs(error)) < 0.1, f"seed {camera.seed}"
     assert abs(error.mean()) < 0.05
-    assert any("wider than line_width_px" in line for line in reconstructor.warnings)
+    assert any("1.5 times as wide as line_width_px" in line for line in reconstructor.warnings)
 
 
 def _kept(camera: Camera, share: float) -> Events:
@@ -522,13 +522,31 @@ def test_the_default_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_pa
     assert error_mm["chosen"] == pytest.approx(error_mm["learned"], rel=0.02)
 
 
+def _cut_everywhere(camera: Camera, at: float) -> tuple[Profiles, np.ndarray, Reconstructor]:
+    """Return points of a line near the sensor's edge, their errors in rows, and their source."""
+    found, reconstructor = points(camera, camera.line(lambda k, c: at + 0.6 * np.sin(c / 40.0)))
+    return found, found.row - (at + 0.6 * np.sin(found.column / 40.0)), reconstructor
+
+
 @pytest.mark.parametrize("at", [3.0, 10.0, 714.0])
-def test_a_line_that_is_cut_in_every_column_has_an_honest_sigma_and_a_small_bias(at):
-    camera = Camera(periods=36)
-    found, _ = points(camera, camera.line(lambda k, c: at + 0.6 * np.sin(c / 40.0)))
-    error = found.row - (at + 0.6 * np.sin(found.column / 40.0))
+@pytest.mark.parametrize(("half_width_px", "bias_px"), [(5.5, 0.1), (9.0, 0.35)])
+def test_a_line_that_is_cut_in_every_column_has_a_small_bias_from_the_fifth_profile_on(
+    at, half_width_px, bias_px
+):
+    camera = Camera(periods=16, half_width_px=half_width_px)
+    found, error, reconstructor = _cut_everywhere(camera, at)
     assert np.mean(np.abs(error) < 2.0 * found.sigma_row) > 0.93, f"seed {camera.seed}"
-    assert abs(error[found.period >= 32].mean()) < 0.15
+    for period in range(4, 16):
+        assert abs(error[found.period == period].mean()) < bias_px, f"seed {camera.seed}"
+    wide = [line for line in reconstructor.warnings if "the sensor's edge cuts the line" in line]
+    assert len(wide) == (np.mean(found.flags & SENSOR_EDGE > 0) > 0.5)
+
+
+@pytest.mark.parametrize("at", [3.0, 10.0, 714.0])
+def test_a_cut_line_of_evenly_lit_pixels_shows_no_centre_and_has_an_honest_sigma(at):
+    camera = Camera(periods=16, half_width_px=9.0, **MANY_EVENTS)
+    found, error, _ = _cut_everywhere(camera, at)
+    assert np.mean(np.abs(error) < 2.0 * found.sigma_row) > 0.93, f"seed {camera.seed}"
 
 
 def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost():
