@@ -15,6 +15,8 @@ _STEPS = 2.5
 # Power of a line over the mean of the power between the lines.
 _LINE_MIN = 50.0
 _STRONG = 0.5
+# Power of a line over that beside it, which a stronger one leaks.
+_BESIDE_MIN = 4.0
 # Turns between two frequencies over the window, and their relative difference: clocks differ less.
 _TURNS_MAX = 0.25
 _CLOCKS_MAX = 1e-3
@@ -69,7 +71,9 @@ class FrequencyEstimate:
         counts = self._busiest[:, used[0] : used[-1] + 1]
         length = 1 << int(np.ceil(np.log2(_STEPS * counts.shape[1])))
         step_hz = 1e6 / (length * _BIN_US)
-        spectrum = np.fft.rfft(counts - counts.mean(axis=1, keepdims=True), length, axis=1)
+        # A window with soft ends keeps a strong light from hiding a weak one.
+        soft = (counts - counts.mean(axis=1, keepdims=True)) * np.hanning(counts.shape[1])
+        spectrum = np.fft.rfft(soft, length, axis=1)
         power = (np.abs(spectrum) ** 2).sum(axis=0)
         low = max(round(0.9 * FREQUENCY_MIN_HZ / step_hz), 1)
         high = round(FREQUENCY_MAX_HZ / step_hz)
@@ -77,11 +81,22 @@ class FrequencyEstimate:
         if strongest < _LINE_MIN * float(np.median(power[low:high])):
             return None
 
+        def highest(from_hz: float, to_hz: float) -> float:
+            near = power[max(int(from_hz / step_hz), 0) : int(to_hz / step_hz) + 2]
+            return float(near.max(initial=0.0))
+
         def strong(frequency_hz: float) -> bool:
-            reach = _TURNS_MAX / span_s
-            first, last = ((frequency_hz + side * reach) / step_hz for side in (-1, 1))
-            near = power[int(first) : int(last) + 2]
-            return bool(near.max(initial=0.0) >= _STRONG * strongest)
+            reach_hz = _TURNS_MAX / span_s
+            near = highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
+            return near >= _STRONG * strongest
+
+        def stands_out(frequency_hz: float) -> bool:
+            reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
+            near = highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
+            below = highest(frequency_hz - outer_hz, frequency_hz - inner_hz)
+            above = highest(frequency_hz + inner_hz, frequency_hz + outer_hz)
+            noise = _LINE_MIN * float(np.median(power[low:high]))
+            return near >= max(noise, _BESIDE_MIN * max(below, above))
 
         peak = low + int(np.argmax(power[low:high] >= _STRONG * strongest))
         while power[peak + 1] > power[peak]:
@@ -94,7 +109,7 @@ class FrequencyEstimate:
         tolerance_hz = max(_TURNS_MAX / span_s, _CLOCKS_MAX * expected_hz)
         if apart_hz <= tolerance_hz:
             return expected_hz
-        if apart_hz <= _LOBE / span_s or not strong(expected_hz):
+        if apart_hz <= _LOBE / span_s or not stands_out(expected_hz):
             return found_hz
         # Another light may blink as well: then the multiples between the two are weak.
         multiple = round(expected_hz / found_hz)

@@ -14,7 +14,9 @@ from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import between
 
-_PIECE_BYTES = 1 << 23
+# Bytes that show the frequency, more where they hold few turns of it: lamps have near ones.
+_PIECE_BYTES, _PIECES_MAX = 1 << 23, 8
+_TURNS_ENOUGH = 20
 # So many events of a chunk show what all do.
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
@@ -48,14 +50,17 @@ def shown_frequency_hz(recording: Recording) -> float | None:
     header = reader.header
     decoder = Decoder(header.width, header.height)
     begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
-    done = 0
+    done, first_us = 0, None
     for chunk in reader.chunks(_CHUNK_BYTES, begin):
         events = decoder.decode(chunk)
         every = max(len(events) // _CHUNK_EVENTS, 1)
         estimate.add(events.t[::every], events.p[::every])
         done += len(chunk)
-        if done >= _PIECE_BYTES:
-            break
+        if len(events):
+            first_us = int(events.t[0]) if first_us is None else first_us
+            turns = (int(events.t[-1]) - first_us) / recording.modulation.period_us
+            if done >= _PIECE_BYTES * (1 if turns > _TURNS_ENOUGH else _PIECES_MAX):
+                break
     return estimate.frequency_hz(recording.modulation.frequency_hz)
 
 

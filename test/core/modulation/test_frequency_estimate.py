@@ -37,6 +37,10 @@ def test_another_light_does_not_hide_the_laser():
     lamp = bursts(100.0, 3.0, per_burst=800, width=0.5)
     laser = bursts(300.0, 3.0, per_burst=200)
     assert shown_hz(300.0, lamp, laser, NOISE) == 300.0
+    # A lamp with eight times the events, seen for a fifth of a second.
+    bright = bursts(100.0, 0.2, per_burst=12_000, width=0.5)
+    assert shown_hz(70.0, bright, bursts(70.0, 0.2, per_burst=2_000)) == 70.0
+    assert shown_hz(70.0, bright) == pytest.approx(100.0, rel=0.01)
 
 
 def test_events_without_rhythm_show_none():
