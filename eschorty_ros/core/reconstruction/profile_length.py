@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
+from eschorty_ros.core.line.blinking import PERIOD_MIN_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
@@ -19,6 +21,10 @@ EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _BLOCK_PERIODS = 2
 _PERIODS_MIN = 4
+# As many show whether the rows of successive periods differ, where pixels or the readout are slower
+# than these.
+_SHORT_PERIODS_MIN = 16
+_UNEVEN_ROWS = 1.5
 _BLOCK_EVENTS = 1 << 16
 # Part of the columns that may have few events.
 _FEW_SHARE = 1.0 / 24.0
@@ -49,7 +55,8 @@ class ProfileLength:
     half of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the
     default of ``events_min``. Else, or where periods are not even and more columns have less, a
     profile has as many periods as give `EVENTS_WANTED`, or the next number with which profiles are
-    even: pixels that follow every third period give most events in two of three. Where one period
+    even: pixels that follow every third period give most events in two of three, and in periods
+    shorter than a readout or a refractory time not those of the same rows. Where one period
     is not enough in the first block, with twice as many events, the next one counts, since pixels
     give more when the laser is switched on. Blocks without light do not count. A block has
     `BLOCK_US`, but two periods at least; the first one ends with enough events after four.
@@ -89,7 +96,7 @@ class ProfileLength:
                     t = held.arrays[0]
             first, begin = self._window
             end_us, periods = int(t[begin - 1]), 0
-            block: tuple[Array, NDArray[np.uint16]] | None = None
+            block: tuple[Array, NDArray[np.uint16], NDArray[np.uint16]] | None = None
             if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
@@ -101,8 +108,8 @@ class ProfileLength:
                 edge_us = self._edge_us(held, begin, end)
                 if edge_us is not None and edge_us <= t[end - 1]:
                     after = int(np.searchsorted(t, edge_us))
-                    t_us, columns = (values[after:end] for values in held.arrays[:2])
-                    block = (t_us - edge_us) / period_us, columns
+                    t_us, columns, rows = (values[after:end] for values in held.arrays[:3])
+                    block = (t_us - edge_us) / period_us, columns, rows
                 if block is not None:
                     periods = self._periods(*block, enough)
                 if periods == 1:
@@ -119,7 +126,8 @@ class ProfileLength:
         if short and t_us.size > begin + _BLOCK_EVENTS:
             period_us = self._modulation.period_us
             periods = math.ceil((int(t_us[begin + _BLOCK_EVENTS]) - begin_us) / period_us)
-            end_us = min(end_us, begin_us + round(max(periods, _PERIODS_MIN) * period_us))
+            least = _SHORT_PERIODS_MIN if period_us < PERIOD_MIN_US else _PERIODS_MIN
+            end_us = min(end_us, begin_us + round(max(periods, least) * period_us))
         return end_us
 
     def _edge_us(self, held: HeldEvents, begin: int, end: int) -> int | None:
@@ -131,31 +139,38 @@ class ProfileLength:
         phase = estimate_phase(t, p, self._modulation)
         return phase.edge_us if phase.found or _is_line(x, y) else None
 
-    def _periods(self, turns: Array, columns: NDArray[np.uint16], enough: int) -> int:
+    def _periods(
+        self, turns: Array, columns: NDArray[np.uint16], rows: NDArray[np.uint16], enough: int
+    ) -> int:
         """Return the periods of a profile; one where a column has ``enough`` events in a period.
 
         ``turns`` are the times of the events since an edge, periods.
         """
         shape = int(turns[-1]) + 1, int(columns.max()) + 1
         index = turns.astype(np.int64) * shape[1] + columns
-        counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+        size = shape[0] * shape[1]
+        counts = np.bincount(index, minlength=size).reshape(shape)
+        sums = np.bincount(index, rows, size).astype(np.float64).reshape(shape)
         # The last period may not be whole.
         counts = counts[: max(round(float(turns[-1])), 1)]
         # The laser may be on for a part of the block.
         in_period = counts.sum(axis=1)
         lit = np.flatnonzero(in_period >= _LIT_SHARE * in_period.max())
         on = slice(lit[0], lit[-1] + 1)
-        counts, in_period = counts[on], in_period[on]
+        counts, sums, in_period = counts[on], sums[on], in_period[on]
         of_column = counts.sum(axis=0)
         pairs = of_column * (of_column - 1)
         weights = pairs / max(pairs.sum(), 1)
         events = max(float((counts @ weights).mean()), 1e-9)
         few = np.mean((counts < EVENTS_WANTED // 4) @ weights)
-        if events >= enough and (few <= _FEW_SHARE or _are_even(in_period, 1)):
-            return 1
-        wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
+        wanted = 1
+        if events < enough or (few > _FEW_SHARE and not _are_even(in_period, 1)):
+            wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
         longer = range(wanted, len(counts) // _PROFILES_MIN + 1)
-        return next((periods for periods in longer if _are_even(in_period, periods)), wanted)
+        even = [periods for periods in longer if wanted == 1 or _are_even(in_period, periods)]
+        if self._modulation.period_us < PERIOD_MIN_US:
+            even = _with_even_rows(even, counts, sums)
+        return next(iter(even), wanted)
 
 
 def _are_even(in_period: NDArray[np.int64], periods: int) -> bool:
@@ -163,6 +178,30 @@ def _are_even(in_period: NDArray[np.int64], periods: int) -> bool:
     whole = in_period[: len(in_period) // periods * periods]
     profiles = whole.reshape(-1, periods).sum(axis=1)
     return bool(profiles.std() <= _UNEVEN_SHARE * profiles.mean())
+
+
+def _with_even_rows(candidates: list[int], counts: NDArray[np.int64], sums: Array) -> list[int]:
+    """Return those periods of a profile with which rows scatter about as little as with others.
+
+    Their variance times the periods is the same where all periods show the same rows.
+    """
+    scatter = [periods * _row_variance(counts, sums, periods) for periods in candidates]
+    if not np.isfinite(scatter).any():
+        return candidates
+    most = _UNEVEN_ROWS * np.nanmin(scatter)
+    return [periods for periods, own in zip(candidates, scatter, strict=True) if own <= most]
+
+
+def _row_variance(counts: NDArray[Any], sums: Array, periods: int) -> float:
+    """Return the variance of rows from one profile of so many periods to the next, NaN of none."""
+    shape = len(counts) // periods, periods, -1
+    whole = slice(shape[0] * periods)
+    number, total = (values[whole].reshape(shape).sum(axis=1) for values in (counts, sums))
+    known = number.min(axis=0) >= EVENTS_WANTED // 4
+    if not known.any():
+        return math.nan
+    differences = np.diff(total[:, known] / number[:, known], axis=0)
+    return float(np.mean(differences * differences))
 
 
 def _is_line(columns: NDArray[np.uint16], rows: NDArray[np.uint16]) -> bool:

@@ -406,8 +406,9 @@ class Reconstructor:
             )
         if self.settings.periods_per_profile == 0 and every > 1:
             found.append(
-                f"a column has too few events for a point in one period; {every} periods make a "
-                f"profile, {self.modulation.frequency_hz / every:.4g} profiles per second"
+                "a column has too few events for a point in one period, or others in the next; "
+                f"{every} periods make a profile, "
+                f"{self.modulation.frequency_hz / every:.4g} profiles per second"
             )
         return found
 

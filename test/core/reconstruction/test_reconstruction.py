@@ -431,6 +431,25 @@ def test_a_dense_stream_gives_profiles_after_a_window_and_two_periods():
     assert reconstructor.periods_per_profile == 1
 
 
+@pytest.mark.parametrize(("jump_px", "every"), [(0.0, 1), (3.0, 2)])
+def test_profiles_have_as_many_periods_as_show_the_same_rows(jump_px, every):
+    """Pixels whose refractory time is longer than a period answer in turns."""
+    rng = np.random.default_rng(SEED)
+    line = line_events(
+        rng,
+        lambda k, c: 350.0 + jump_px * (-1.0) ** k + 0.0 * c,
+        frequency_hz=20_000.0,
+        periods=600,
+        columns=300,
+        events=30.0,
+        background=0.0,
+    )
+    found, reconstructor = reconstruct(encoded(line), Modulation(20_000.0))
+    assert reconstructor.periods_per_profile == every, f"seed {SEED}"
+    assert np.median(np.abs(found.row - 350.0)) < 1.0
+    assert any("or others in the next" in line for line in reconstructor.warnings) == (every > 1)
+
+
 def test_a_long_dark_stretch_does_not_choose_the_periods_of_a_profile(monkeypatch):
     monkeypatch.setattr(profile_length, "HELD_EVENTS_MAX", 20_000)
     rng = np.random.default_rng(SEED)
