@@ -42,6 +42,10 @@ _NEAR_PLACES = 5.4
 _STRUCTURE_MIN = 4.0
 _SYMMETRIC = 0.1
 _ERROR_MAX = 2 * _PLACES
+# Share of the largest mean count at the ends of a footprint, and the distance of its mean from the
+# middle of these that is a fault: up to 0.2 on lines that move, 0.3 to 5 where one side is lost.
+_END_SHARE = 0.2
+_LOPSIDED_PX = 0.25
 # Steps of a log-likelihood of one.
 _LOG_ONE = 64
 # The least log-likelihood of a row in steps, and the least of all rows, which fits 16 bits.
@@ -84,11 +88,11 @@ class Footprint(NamedTuple):
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
     since; ``all_cut`` is 1 where the last one is of lines that are all cut, whose centre may be so
-    many places ``away``; ``near_edge`` is 1 while the sensor's edge cuts a line, for which means
-    need a footprint, too. ``trying`` is 1 in profiles of
-    the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the sums of how
-    much their rows scatter, in millionths of a row. ``choice`` is what followed from it, one of the
-    three below.
+    many places ``away``; ``lopsided`` counts those of lines that are so, ``near_edge`` is 1 while
+    the sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in
+    profiles of the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the
+    sums of how much their rows scatter, in millionths of a row. ``choice`` is what followed from
+    it, one of the three below.
     """
 
     pixels: NDArray[np.float64]
@@ -125,6 +129,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
             "columns",
             "all_cut",
             "away",
+            "lopsided",
             "near_edge",
             "trying",
             "trials",
@@ -364,12 +369,33 @@ def _centre_error_px(footprint):
 
 
 @kernel
+def _lopsided_px(pixels):
+    """Return how far the mean of the counts by place is from the middle of their ends, rows."""
+    number, events = np.zeros((2, pixels.shape[1]))
+    for k in range(pixels.shape[0]):
+        number += pixels[k]
+        events += k * pixels[k]
+    mean = _near_places(events) / np.maximum(_near_places(number), 1.0)
+    low = high = np.argmax(mean)
+    least = _END_SHARE * mean[low]
+    while low > 0 and mean[low - 1] > least:
+        low -= 1
+    while high < mean.size - 1 and mean[high + 1] > least:
+        high += 1
+    places = np.arange(low, high + 1)
+    centre = (places * mean[low : high + 1]).sum() / max(mean[low : high + 1].sum(), 1e-9)
+    return (centre - 0.5 * (low + high)) / _PLACES
+
+
+@kernel
 def _compute(footprint, whole):
     """Compute the logarithms from the counts of pixels, of ``whole`` lines or of cut ones."""
     pixels, log, none = footprint.pixels, footprint.log, footprint.none
     size = pixels.shape[1]
     shares = pixels + pixels[:, ::-1]
-    if not whole:
+    if whole:
+        footprint.state.lopsided += abs(_lopsided_px(pixels)) > _LOPSIDED_PX
+    else:
         middle = size // 2
         centre, footprint.state.away = _centre(pixels)
         for b in range(size):

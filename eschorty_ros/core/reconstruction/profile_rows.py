@@ -113,6 +113,8 @@ COUNTERS = (
     "columns_unmodulated",
     "events_unmodulated",
     "points_burst_shift",
+    "footprints",
+    "footprints_lopsided",
 )
 CLOSED, EMPTY, FILLED = 0, 1, 2
 """Status of the open period: there is none, it has no events, it has some."""
@@ -355,7 +357,10 @@ def _close(memory):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
+        computations, lopsided = footprint.state.computations, footprint.state.lopsided
         _learn(footprint, rows, smoothing.row[0], estimator.sensor_rows)
+        counters.footprints += footprint.state.computations - computations
+        counters.footprints_lopsided += footprint.state.lopsided - lopsided
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.

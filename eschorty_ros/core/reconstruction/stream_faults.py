@@ -57,4 +57,9 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
             "points: the readout loses one side of the line, or the line is lopsided; sigma "
             f"has the difference; {_FEWER_EVENTS}"
         )
+    elif 2 * counts["footprints_lopsided"] > counts["footprints"]:
+        found.append(
+            "the mean of the line's rows is not in the middle of its ends: the readout loses one "
+            f"side, or the line is lopsided; calibrate with this light, or {_FEWER_EVENTS}"
+        )
     return found

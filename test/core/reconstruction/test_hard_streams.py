@@ -299,6 +299,16 @@ def _kept(camera: Camera, share: float) -> Events:
     return t[kept], x[kept], y[kept], p[kept]
 
 
+@pytest.mark.parametrize(("lost", "half_width_px"), [(False, 5.5), (True, 5.5), (True, 12.0)])
+def test_a_line_that_has_lost_one_side_at_all_times_has_a_warning(lost, half_width_px):
+    camera = Camera(periods=12, half_width_px=half_width_px)
+    t, x, y, p = camera.line(wavy)
+    period = (t - FIRST_EDGE_US) * camera.frequency_hz // 1e6
+    kept = (y < wavy(period, x)) | (not lost)
+    _, reconstructor = points(camera, (t[kept], x[kept], y[kept], p[kept]))
+    assert any("middle of its ends" in line for line in reconstructor.warnings) == lost
+
+
 @pytest.mark.parametrize(("share", "error_max_mm"), [(0.22, 1.0), (0.5, 0.5)])
 def test_rows_that_scatter_more_are_averaged_and_have_an_honest_sigma(share, error_max_mm):
     camera = Camera(periods=16)
