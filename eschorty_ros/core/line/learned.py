@@ -444,7 +444,7 @@ def _learn(footprint, rows, smoothed, sensor_rows):
     """
     row, uncertain, truncated = rows.row[0], rows.uncertain[0], rows.truncated[0]
     state = footprint.state
-    whole = 4 * np.count_nonzero(truncated) < 3 * np.count_nonzero(np.isfinite(row))
+    whole = 4 * np.count_nonzero(truncated) <= 3 * np.count_nonzero(np.isfinite(row))
     pixels = footprint.pixels
     middle = pixels.shape[1] // 2
     for slot in range(footprint.first_row.size):

@@ -306,7 +306,7 @@ def test_a_line_that_has_lost_one_side_at_all_times_has_a_warning(lost, half_wid
     period = (t - FIRST_EDGE_US) * camera.frequency_hz // 1e6
     kept = (y < wavy(period, x)) | (not lost)
     _, reconstructor = points(camera, (t[kept], x[kept], y[kept], p[kept]))
-    assert any("middle of its ends" in line for line in reconstructor.warnings) == lost
+    assert any("the line is lopsided" in line for line in reconstructor.warnings) == lost
 
 
 @pytest.mark.parametrize(("share", "error_max_mm"), [(0.22, 1.0), (0.5, 0.5)])
