@@ -24,6 +24,8 @@ _PERIODS_MIN = 4
 # As many show whether the rows of successive periods differ, where pixels or the readout are slower
 # than these.
 _SHORT_PERIODS_MIN = 16
+# Numbers of periods that are compared, and the variance over the least one that differs from it.
+_CANDIDATES_MAX = 32
 _UNEVEN_ROWS = 1.5
 _BLOCK_EVENTS = 1 << 16
 # Part of the columns that may have few events.
@@ -185,6 +187,7 @@ def _with_even_rows(candidates: list[int], counts: NDArray[np.int64], sums: Arra
 
     Their variance times the periods is the same where all periods show the same rows.
     """
+    candidates = candidates[:_CANDIDATES_MAX]
     scatter = [periods * _row_variance(counts, sums, periods) for periods in candidates]
     if not np.isfinite(scatter).any():
         return candidates
