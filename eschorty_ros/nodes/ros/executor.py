@@ -315,8 +315,9 @@ class Spinning:
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
-            # Tasks that never run would keep their nodes, and so does the executor itself.
-            with contextlib.suppress(ExternalShutdownException):
+            # Tasks that never run would keep their nodes, and so does the executor itself. Requests
+            # that still come, such as a cancel, meet servers that have ended.
+            with contextlib.suppress(Exception):
                 self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
             self.executor.shutdown(timeout_sec=timeout_s)
             self.executor = None
