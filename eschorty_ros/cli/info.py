@@ -67,7 +67,8 @@ def command(path: Path) -> None:
         if recording.scan is not None:
             rows |= _scan(recording.scan)
         pairs(str(path), rows | _truth(recording.truth))
-        for fault in stage_faults(recording, _raw(recording.events_path)):
+        span_us = _raw(recording.events_path)
+        for fault in stage_faults(recording, span_us) if span_us else []:
             warn(fault)
     elif path.suffix in (".pcd", ".ply"):
         _cloud(path)
@@ -167,7 +168,7 @@ def _cloud(path: Path) -> None:
     pairs(str(path), rows)
 
 
-def _raw(path: Path) -> tuple[int, int]:
+def _raw(path: Path) -> tuple[int, int] | None:
     """Show a file of the camera's bytes; return the sensor times of its first and last event."""
     import numpy as np
 
@@ -219,4 +220,4 @@ def _raw(path: Path) -> tuple[int, int]:
     pairs(str(path), rows)
     for warning in reader.warnings:
         warn(warning)
-    return first_us, last_us
+    return (first_us, last_us) if events else None
