@@ -25,7 +25,7 @@ from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.executor import Spinning
-from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored
+from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored, tear_down
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
 from eschorty_ros.nodes.viewer.node import ViewerNode
@@ -220,13 +220,7 @@ def _running(
         with signals_ignored():
             spinning.stop_callbacks()
             make_safe(nodes)
-            # An ended context also ends callbacks that wait, such as homing.
-            rclpy.try_shutdown()
-            spinning.end(2.0)
-            if second is not None:
-                second.end()
-            for node in nodes:
-                node.destroy_node()
+            tear_down(nodes, second, spinning)
 
 
 def _parameter_file(values: Tables) -> str:

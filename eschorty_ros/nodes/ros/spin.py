@@ -185,7 +185,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         make_safe(nodes)
         if deadlocked:
             _exit_without_dds(nodes)
-        _tear_down(nodes, second, spinning)
+        tear_down(nodes, second, spinning)
     return code
 
 
@@ -219,10 +219,11 @@ def _exit_without_dds(nodes: Sequence[Node]) -> None:
     os._exit(1)
 
 
-def _tear_down(nodes: list[Node], second: SecondNodes | None, spinning: Spinning | None) -> None:
+def tear_down(nodes: list[Node], second: SecondNodes | None, spinning: Spinning | None) -> None:
     """Leave DDS: it does when nothing refers to a node any more, no variable either.
 
-    Until then others list the node, for 20 s where its process ends before.
+    Until then others list the node, for 20 s where its process ends before. Callbacks end before
+    the context: what they take from an ended one may crash rclpy 9.1's EventsExecutor.
     """
     if spinning is not None:
         spinning.end()
