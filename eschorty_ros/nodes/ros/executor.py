@@ -211,6 +211,10 @@ class _Redirecting:
         waitable.execute = executed
 
 
+def _add_thread(threads: list[threading.Thread]) -> None:
+    threads.append(threading.current_thread())
+
+
 class EventExecutor(_Redirecting, _Events):
     """rclpy's ``EventsExecutor`` with the callback groups of ``MultiThreadedExecutor``.
 
@@ -221,7 +225,9 @@ class EventExecutor(_Redirecting, _Events):
     def __init__(self, threads: int, context: Context) -> None:
         _Redirecting.__init__(self)
         _Events.__init__(self, context)
-        self._pool = ThreadPoolExecutor(threads, "callback")
+        self._threads: list[threading.Thread] = []
+        # No method of its own: in a cycle of references it would outlive its nodes.
+        self._pool = ThreadPoolExecutor(threads, "callback", _add_thread, (self._threads,))
         self._groups: dict[CallbackGroup, _InTurn] = {}
 
     def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -239,10 +245,10 @@ class EventExecutor(_Redirecting, _Events):
 
         return super().create_task(called)
 
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop; callbacks that still wait do not run."""
+    def end_callbacks(self) -> bool:
+        """Let callbacks that still wait not run; return whether one is running."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-        return bool(super().shutdown(timeout_sec))
+        return any(thread.is_alive() for thread in self._threads)
 
     def _submit(self, group: CallbackGroup, work: Work) -> None:
         if isinstance(group, ShortGroup):
@@ -270,6 +276,10 @@ class ThreadsExecutor(_Redirecting, MultiThreadedExecutor):
             # While a callback runs, rclpy 9 polls for the next of its group without a pause and
             # would hold the interpreter's lock.
             time.sleep(_PAUSE_S)
+
+    def end_callbacks(self) -> bool:
+        """Return that none is running: the executor's own shutdown waits for them."""
+        return False
 
     def _submit(self, group: CallbackGroup, work: Work) -> None:
         work()
@@ -315,10 +325,14 @@ class Spinning:
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
-            # Tasks that never run would keep their nodes, and so does the executor itself. Requests
-            # that still come, such as a cancel, meet servers that have ended.
-            with contextlib.suppress(Exception):
-                self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
+            # Tasks that never run would keep their nodes, also those that the last callbacks begin,
+            # and so does the executor itself. Requests that still come, such as a cancel, meet
+            # servers that have ended.
+            end_s, running = time.monotonic() + timeout_s, True
+            while running and time.monotonic() < end_s:
+                running = self.executor.end_callbacks()
+                with contextlib.suppress(Exception):
+                    self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
             self.executor.shutdown(timeout_sec=timeout_s)
             self.executor = None
 
