@@ -16,6 +16,7 @@ EDGES_MAX = 1 << 14
 
 _JUMP_PERIODS = 4096  # longer gaps are skipped in one step
 _TOLERANCE_SHARE = 4  # a trigger belongs to an edge within this part of the period
+_MISSING_SHARE = Fraction(1, 4)  # of a first profile that may be missing
 _MISSED_MAX = 3  # after as many edges without a trigger any trigger sets a new phase
 
 
@@ -126,11 +127,16 @@ class EdgeSchedule:
     def anchor(self, edge_us: int, start_us: int) -> None:
         """Fix the phase by an edge at ``edge_us`` and begin with the last edge until ``start_us``.
 
-        With ``every`` > 1 it is the last one whose index is a multiple of it.
+        With ``every`` > 1 it is the last one whose index is a multiple of it. It is the next one
+        where more than `_MISSING_SHARE` of that profile is over: in what is left of it anything
+        follows the laser.
         """
         every = self._parts.every
         self._state = _State(anchor_us=edge_us)
-        self._seek((self._step_at(start_us) // every) * every - 1)
+        first = (self._step_at(start_us) // every) * every
+        if start_us - self._edge_us(first) > _MISSING_SHARE * every * self._period:
+            first += every
+        self._seek(first - 1)
         self.anchored = True
 
     def jump(self, t_us: int) -> None:

@@ -254,6 +254,17 @@ def test_what_does_not_follow_the_laser_moves_no_points(case):
     assert reconstructor.counters["events_dropped"] == 0
 
 
+def test_the_rest_of_a_period_before_the_light_gives_no_points():
+    camera = Camera(periods=12)
+    dark_us = 4000
+    t, x, y, p = camera.line(wavy)
+    data = stream((t + dark_us, x, y, p), camera.moving_object(3e6))
+    modulation = Modulation(camera.frequency_hz, on_edge_us=FIRST_EDGE_US + dark_us)
+    found, _ = reconstruct(data, modulation, Settings())
+    false = np.abs(error_mm(found)) > 20.0
+    assert false.sum() <= 10, f"seed {camera.seed}"
+
+
 @pytest.mark.parametrize(
     ("camera", "settings"),
     [
