@@ -289,6 +289,11 @@ def test_info_warns_of_a_recording_that_is_cut(recording, tmp_path):
     assert "the stage moves" in done.stderr
     assert "events.raw is cut: copy it again" in done.stderr
     assert not run("info", recording).stderr
+    header = data[: data.index(b"% end\n") + 6]
+    (tmp_path / "rec" / "events.raw").write_bytes(header)
+    done = run("info", tmp_path / "rec")
+    assert done.exit_code == 0
+    assert "is cut" not in done.stderr
 
 
 @pytest.mark.parametrize(

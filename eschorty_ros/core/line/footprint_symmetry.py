@@ -17,8 +17,10 @@ _PLACES = 8
 # seen on both sides of it.
 _CENTRES = 8 * _PLACES
 _BOTH_SIDES_MIN = 2 * _PLACES
-# Sum of squares over sum of the weights of near places, for the variance of their mean.
-_NEAR_PLACES = 5.4
+# Weights of near places, which fall linearly, and their sum of squares over the sum: for the
+# variance of a mean.
+_WEIGHTS = _PLACES - np.abs(np.arange(1.0 - _PLACES, _PLACES))
+_NEAR_PLACES = float((_WEIGHTS * _WEIGHTS).sum() / _WEIGHTS.sum())
 # Variance over that by chance of counts that show a structure, the asymmetry of a centre, and its
 # largest error.
 _STRUCTURE_MIN = 4.0
@@ -59,23 +61,13 @@ def _asymmetry(places, centre):
 
 @kernel
 def _near_places(values):
-    """Return the sums of values over a row on either side, with weights that fall linearly."""
-    sums = np.zeros(values.size)
-    for b in range(values.size):
-        for near in range(max(b - _PLACES + 1, 0), min(b + _PLACES, values.size)):
-            sums[b] += (_PLACES - abs(b - near)) * values[near]
-    return sums
+    """Return the weighted sums of values over a row on either side."""
+    return np.convolve(values, _WEIGHTS)[_PLACES - 1 : 1 - _PLACES]
 
 
 @kernel
-def _centre(pixels):
-    """Return the place about which the mean counts by place are symmetric, and its error.
-
-    Rows of lines that are all cut are off by about as much: their footprint has its centre there,
-    and no places beyond the sensor. The error is the distance to the furthest symmetric place. It
-    is -1, and the centre the middle, where there are none or many.
-    """
-    middle = pixels.shape[1] // 2
+def _mean_counts(pixels):
+    """Return by place the number of pixels, the mean of their events and its variance for one."""
     number, events, squares = np.zeros((3, pixels.shape[1]))
     for k in range(pixels.shape[0]):
         number += pixels[k]
@@ -86,7 +78,18 @@ def _centre(pixels):
     mean = _near_places(events) / known
     # Counts that are all the same vary by less than a whole one.
     variance = _near_places(squares) / known - mean * mean + _WHOLE
-    places = number / _NEAR_PLACES, mean, variance
+    return number / _NEAR_PLACES, mean, variance
+
+
+@kernel
+def _centre(pixels):
+    """Return the place about which the mean counts by place are symmetric, and its error.
+
+    Rows of lines that are all cut are off by about as much: their footprint has its centre there,
+    and no places beyond the sensor. The error is the distance to the furthest symmetric place. It
+    is -1, and the centre the middle, where there are none or many.
+    """
+    middle, places = pixels.shape[1] // 2, _mean_counts(pixels)
     best, least, error = middle, _SYMMETRIC, -1
     tried = range(middle - _CENTRES, middle + _CENTRES + 1)
     for centre in tried:
@@ -102,11 +105,7 @@ def _centre(pixels):
 @kernel
 def _is_lopsided(pixels):
     """Return true when the mean of the counts by place is not in the middle of their ends."""
-    number, events = np.zeros((2, pixels.shape[1]))
-    for k in range(pixels.shape[0]):
-        number += pixels[k]
-        events += k * pixels[k]
-    mean = _near_places(events) / np.maximum(_near_places(number), 1.0)
+    mean = _mean_counts(pixels)[1]
     low = high = np.argmax(mean)
     least = _END_SHARE * mean[low]
     while low > 0 and mean[low - 1] > least:
