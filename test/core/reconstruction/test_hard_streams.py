@@ -261,6 +261,7 @@ def test_the_rest_of_a_period_before_the_light_gives_no_points():
     data = stream((t + dark_us, x, y, p), camera.moving_object(3e6))
     modulation = Modulation(camera.frequency_hz, on_edge_us=FIRST_EDGE_US + dark_us)
     found, _ = reconstruct(data, modulation, Settings())
+    assert len(found) > 0.99 * 12 * 1280
     false = np.abs(error_mm(found)) > 20.0
     assert false.sum() <= 10, f"seed {camera.seed}"
 
