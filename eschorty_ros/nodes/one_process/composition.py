@@ -25,7 +25,7 @@ from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.executor import Spinning
-from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored, tear_down
+from eschorty_ros.nodes.ros.spin import end_nodes, signals_ignored
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
 from eschorty_ros.nodes.viewer.node import ViewerNode
@@ -218,9 +218,7 @@ def _running(
         yield made
     finally:
         with signals_ignored():
-            spinning.stop_callbacks()
-            make_safe(nodes)
-            tear_down(nodes, second, spinning)
+            end_nodes(nodes, second, spinning)
 
 
 def _parameter_file(values: Tables) -> str:

@@ -179,13 +179,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             code = 1
     finally:
         _ignore_signals()
-        # A callback must not switch on what has been made safe.
-        if spinning is not None:
-            spinning.stop_callbacks()
-        make_safe(nodes)
-        if deadlocked:
-            _exit_without_dds(nodes)
-        tear_down(nodes, second, spinning)
+        end_nodes(nodes, second, spinning, deadlocked)
     return code
 
 
@@ -219,12 +213,24 @@ def _exit_without_dds(nodes: Sequence[Node]) -> None:
     os._exit(1)
 
 
-def tear_down(nodes: list[Node], second: SecondNodes | None, spinning: Spinning | None) -> None:
-    """Leave DDS: it does when nothing refers to a node any more, no variable either.
+def end_nodes(
+    nodes: list[Node],
+    second: SecondNodes | None,
+    spinning: Spinning | None,
+    deadlocked: bool = False,
+) -> None:
+    """Make the hardware safe, end the nodes and leave DDS; where DDS is deadlocked, the process.
 
-    Until then others list the node, for 20 s where its process ends before. Callbacks end before
-    the context: what they take from an ended one may crash rclpy 9.1's EventsExecutor.
+    Nodes leave DDS when nothing refers to them any more, no variable either. Until then others list
+    them, for 20 s where the process ends before. Callbacks end before the context: what they take
+    from an ended one may crash rclpy 9.1's EventsExecutor.
     """
+    # A callback must not switch on what has been made safe.
+    if spinning is not None:
+        spinning.stop_callbacks()
+    make_safe(nodes)
+    if deadlocked:
+        _exit_without_dds(nodes)
     if spinning is not None:
         spinning.end()
     if second is not None:
