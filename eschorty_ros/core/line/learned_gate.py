@@ -32,8 +32,9 @@ from eschorty_ros.core.modulation.phase_gate import (
 _LENGTHS = 5
 # Columns that are tested for moving together.
 _TOGETHER = 16
-# Mean square of the sum of their differences over the sum of the squares, which is 1 by chance.
-_TOGETHER_MAX = 2.0
+# Mean square of the sum of their differences over the sum of the squares: 1 by chance, as much as
+# columns are alike on a textured surface, and the number of all where the line moves.
+_TOGETHER_MAX = 6.0
 # Standard deviations by which a column's number of late events exceeds the usual one.
 _DEVIATIONS = 3.0
 # Events for a row.

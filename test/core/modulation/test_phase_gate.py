@@ -128,6 +128,21 @@ def test_few_gross_errors_are_left_in_strong_background():
     assert spread[GATE_LEARNED] < 0.7 * spread[0], f"seed {SEED}: {spread}"
 
 
+def test_background_that_is_alike_in_near_columns_is_gated():
+    signal = line(70.0)
+    t, x, y, p = background(20.0, int(signal[0][-1]))
+    texture = [(t, (x + shift) % COLUMNS, y, p) for shift in range(5)]
+    data = stream([signal, *texture])
+    modulation = Modulation(70.0, on_edge_us=EDGE_US)
+    true_row = CALIBRATION.model().row(1320.0)
+    without, learned = (
+        np.quantile(np.abs(run(data, modulation, gate_us)[0].row - true_row), 0.68)
+        for gate_us in (0, GATE_LEARNED)
+    )
+    print(f"seed {SEED}: {without:.3f} px, with the gate {learned:.3f} px")
+    assert learned < 0.7 * without
+
+
 @dataclass(frozen=True)
 class HalfDark(Plane):
     """The second half of the travel is dark, where pixels are slow."""
