@@ -16,6 +16,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
@@ -358,7 +359,8 @@ class Reconstructor:
         found += stream_faults(counts)
         if is_unreadable(counts):
             return found
-        if 2 * counts["events_gated"] > counts["events"]:
+        learned = self.settings.phase_gate_us == GATE_LEARNED
+        if 2 * counts["events_gated"] > counts["events"] and not learned:
             share = counts["events_gated"] / counts["events"]
             found.append(
                 f"phase_gate_us removes {share:.0%} of the events; set it to 0, or check the "
@@ -387,7 +389,8 @@ class Reconstructor:
             found.append(
                 "the line is more than 1.5 times as wide as line_width_px = "
                 f"{self.settings.line_width_px:g} in {counts['profiles_too_wide']} of "
-                f"{counts['periods_closed']} profiles; focus the laser, or raise it"
+                f"{counts['periods_closed']} profiles; focus the laser, raise it, or set "
+                "phase_gate_us to -1 where background beside the line makes it wide"
             )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]
