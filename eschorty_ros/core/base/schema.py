@@ -21,7 +21,7 @@ from typing import (
 )
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number, short
+from eschorty_ros.core.base.numbers import integer, number, short
 from eschorty_ros.core.base.yaml_file import Document, Keys
 
 
@@ -60,8 +60,7 @@ class Within(NamedTuple):
     def remedy(self, kind: str) -> str:
         """Return the words for a number outside."""
         names = {"from": self.low, "above": self.above, "up to": self.high, "below": self.below}
-        # The limits of times are no help.
-        bounds = [f"{name} {bound:g}" for name, bound in names.items() if abs(bound) < TIME_LIMIT]
+        bounds = [f"{name} {bound:g}" for name, bound in names.items() if math.isfinite(bound)]
         return " ".join([f"choose {kind}", *bounds])
 
 

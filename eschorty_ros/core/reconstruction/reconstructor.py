@@ -389,8 +389,8 @@ class Reconstructor:
             found.append(
                 "the line is more than 1.5 times as wide as line_width_px = "
                 f"{self.settings.line_width_px:g} in {counts['profiles_too_wide']} of "
-                f"{counts['periods_closed']} profiles; focus the laser, raise it, or set "
-                "phase_gate_us to -1 where background beside the line makes it wide"
+                f"{counts['periods_closed']} profiles; focus the laser, or raise line_width_px"
+                + ("" if learned else "; where background makes it wide set phase_gate_us to -1")
             )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]

@@ -58,7 +58,7 @@ class _LaserFile(Schema):
     frequency_hz: float
     duty: float
     waveform: str
-    on_edge_us: Annotated[int, Within(-(2**63), 2**63 - 1)] | None = None
+    on_edge_us: int | None = None
 
 
 def between(stage_mm: NDArray[np.float64], start_mm: float, stop_mm: float) -> NDArray[np.bool_]:
