@@ -84,7 +84,7 @@ class Variant:
 def filters_of(settings: Settings) -> str:
     """Return the names of the filters of ``settings``."""
     names = [] if settings.noise_filter == "none" else [settings.noise_filter]
-    return " + ".join([*names, "gate"] if settings.phase_gate_us else names) or "none"
+    return " + ".join([*names, "gate"] if settings.phase_gate_us > 0 else names) or "none"
 
 
 def variants() -> list[Variant]:
@@ -100,7 +100,7 @@ def variants() -> list[Variant]:
             )
         )
         for method, noise_filter, gate_us, half_width in product(
-            CENTROIDS, NOISE_FILTERS, (0, GATE_US), SMOOTHING
+            CENTROIDS, NOISE_FILTERS, (DEFAULT.phase_gate_us, GATE_US), SMOOTHING
         )
     ]
 

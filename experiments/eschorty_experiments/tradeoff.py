@@ -167,8 +167,8 @@ def _remarks(summaries: Sequence[Summary], precision: DataTable) -> list[str]:
         "needs no parameters of the camera.",
         f"The phase gate ({GATE_US} us) would bring {gated[TYPICAL].errors.rmse_mm:.2f} and, at "
         f"{100 * worst:g} %, {gated[worst].errors.rmse_mm:.2f} mm in {gate_time:.2f} times the "
-        "time. It is not the default: the delay of a real sensor's events depends on its biases, a "
-        "window that is too short loses the line, and at 1 kHz it covers the period.",
+        "time. The default learns its gate: the delay of a real sensor's events depends on its "
+        "biases, a window that is too short loses the line, and at 1 kHz it covers the period.",
         "Smoothing lowers the 95th percentile of the error from "
         f"{raw.errors.quantile_mm(0.95):.2f} mm without it to "
         f"{narrow.errors.quantile_mm(0.95):.2f} mm with at most {SMOOTHING[1]} columns on either "

@@ -1,4 +1,4 @@
-"""The phase gate with which the rows of a stream scatter least.
+"""The phase gate with which the rows of a stream scatter least, where it halves their variance.
 
 Pixels answer an edge of the laser with a burst of events. Later ones, which they give by themselves
 or long after the edge, say less about where the line is. How long the burst is depends on the
@@ -35,6 +35,9 @@ _TOGETHER = 16
 # Mean square of the sum of their differences over the sum of the squares: 1 by chance, as much as
 # columns are alike on a textured surface, and the number of all where the line moves.
 _TOGETHER_MAX = 6.0
+# Share of the variance of rows that a gate leaves at most: it takes time, and the events it leaves
+# lag more behind a line that moves.
+_VARIANCE_MAX = 0.5
 # Standard deviations by which a column's number of late events exceeds the usual one.
 _DEVIATIONS = 3.0
 # Events for a row.
@@ -46,11 +49,13 @@ _FOUND_MIN = 0.995
 class LearnedGate(NamedTuple):
     """The gate in use, and the choices for one to be learned.
 
-    Both have the fields of a `PhaseGate`. The state is ``known`` once a choice or none is in use,
-    and its ``late`` is the usual number of late events of a column.
+    All have the fields of a `PhaseGate`. The state is ``known`` once a choice is made, the first of
+    which is no gate, and has ``changed`` if that is another than before; its ``late`` is the usual
+    number of late events of a column. Windows begin with the one that is ``kept``.
     """
 
     state: Any
+    kept: Any
     choices: NDArray[np.void]
 
 
@@ -60,7 +65,8 @@ def make_gate(modulation: Modulation, gate_us: int) -> LearnedGate:
         return _gate(phase_gate(modulation, gate_us), [])
     lengths_us = [round(modulation.period_us / (2 << k)) for k in range(_LENGTHS)]
     choices = [phase_gate(modulation, length_us) for length_us in lengths_us]
-    return _gate(PhaseGate(keeps_late=1), [gate for gate in choices if gate.step > 0])
+    none = PhaseGate(keeps_late=1)
+    return _gate(none, [none, *(gate for gate in choices if gate.step > 0)])
 
 
 def same_gate(gate: LearnedGate) -> LearnedGate:
@@ -69,22 +75,37 @@ def same_gate(gate: LearnedGate) -> LearnedGate:
 
 
 def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
-    states = [_state(one) for one in (gate, *choices)]
-    return LearnedGate(states[0], np.array([*states[1:]], states[0].dtype))
+    states = [_state(one) for one in (gate, gate, *choices)]
+    return LearnedGate(states[0], states[1], np.array([*states[2:]], states[0].dtype))
 
 
 def _state(gate: PhaseGate) -> Any:
-    state = record(*PhaseGate._fields, "known", "late")
+    state = record(*PhaseGate._fields, "known", "changed", "late")
     for name, value in gate._asdict().items():
         state[name] = value
     return state
 
 
-@kernel
-def _forget_gate(gate):
-    """Begin to learn again, where the gate is to be learned."""
+@kernel(_nrt=False)
+def _copy_gate(gate, other):
+    """Copy the parts of the period, and the usual number of late events, to another gate."""
+    other.step, other.late = gate.step, gate.late
+    other.on_begin, other.on_span = gate.on_begin, gate.on_span
+    other.off_begin, other.off_span = gate.off_begin, gate.off_span
+
+
+@kernel(_nrt=False)
+def _restart_gate(gate):
+    """Begin to learn again with the gate that is kept, where it is to be learned."""
     if gate.choices.size > 0:
-        gate.state.step = gate.state.known = 0
+        _copy_gate(gate.kept, gate.state)
+        gate.state.known = gate.state.changed = 0
+
+
+@kernel(_nrt=False)
+def _keep_gate(gate):
+    """Keep the gate for the begin of later windows."""
+    _copy_gate(gate.state, gate.kept)
 
 
 @kernel(_nrt=False)
@@ -99,14 +120,15 @@ def _fill_rows(columns, half, gate, row):
         seed = columns.seeds[c]
         if seed < 0:
             continue
-        begin = np.uintp(columns.starts[c])
         events, total = np.int64(0), np.int64(0)
-        for i in range(begin, begin + np.uintp(columns.counts[c])):
-            v = columns.packed[i]
-            offset = np.int64(v & ROW_MASK) * FRACTION - seed
-            if abs(offset) <= half and not _is_late(v >> TIME_SHIFT, v & POLARITY, gate):
-                events += 1
-                total += offset
+        for part in (c, row.size + c):
+            begin = np.uintp(columns.starts[part])
+            for i in range(begin, begin + np.uintp(columns.counts[part])):
+                v = columns.packed[i]
+                offset = np.int64(v & ROW_MASK) * FRACTION - seed
+                if abs(offset) <= half and not _is_late(v >> TIME_SHIFT, v & POLARITY, gate):
+                    events += 1
+                    total += offset
         if events >= _EVENTS_MIN:
             row[c] = (seed + total / events) / FRACTION
             found += 1
@@ -131,35 +153,42 @@ def _usual_late(columns, gate):
     """Return the median number of a column's events outside the gate."""
     late = np.zeros(columns.seeds.size, np.int64)
     for c in range(late.size):
-        begin = np.uintp(columns.starts[c])
-        for i in range(begin, begin + np.uintp(columns.counts[c])):
-            v = columns.packed[i]
-            late[c] += _is_late(v >> TIME_SHIFT, v & POLARITY, gate)
+        for part in (c, late.size + c):
+            begin = np.uintp(columns.starts[part])
+            for i in range(begin, begin + np.uintp(columns.counts[part])):
+                v = columns.packed[i]
+                late[c] += _is_late(v >> TIME_SHIFT, v & POLARITY, gate)
     return np.int64(np.median(late[columns.seeds >= 0]))
 
 
 @kernel(_nrt=True)
 def _learn_gate(columns, half, gate):
-    """Choose the gate from the events of a profile and the lines of the last one."""
+    """Choose the gate from the events of a profile and the lines of the last one.
+
+    Returns true in the profile behind the one that changes the gate.
+    """
     state = gate.state
+    changed, state.changed = state.changed > 0, 0
     if state.known > 0:
-        return
+        return changed
     row, gated = np.empty(columns.seeds.size), np.empty(columns.seeds.size)
-    found = _fill_rows(columns, half, state, row)
-    least = _median_difference(row)
-    if least == np.inf:
-        return
-    state.known = 1
-    for k in range(gate.choices.size):
-        choice = gate.choices[k]
-        if _fill_rows(columns, half, choice, gated) < _FOUND_MIN * found:
+    found = _fill_rows(columns, half, gate.choices[0], row)
+    scatter = _median_difference(row)
+    # Rows of background are not those of a line.
+    if scatter * FRACTION > half:
+        return changed
+    best, least = 0, np.sqrt(_VARIANCE_MAX) * scatter
+    for k in range(1, gate.choices.size):
+        if _fill_rows(columns, half, gate.choices[k], gated) < _FOUND_MIN * found:
             continue
         scatter = _median_difference(gated)
         if scatter < least and not _move_together(gated, row):
-            least = scatter
-            state.step, state.late = choice.step, _usual_late(columns, choice)
-            state.on_begin, state.on_span = choice.on_begin, choice.on_span
-            state.off_begin, state.off_span = choice.off_begin, choice.off_span
+            best, least = k, scatter
+    choice = gate.choices[best]
+    state.known, state.changed = 1, choice.on_span != state.on_span
+    _copy_gate(choice, state)
+    state.late = _usual_late(columns, choice)
+    return changed
 
 
 @kernel(_nrt=True)

@@ -29,7 +29,7 @@ from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import Arrays
-from eschorty_ros.core.modulation.phase_gate import _gate_part
+from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profile_rows import (
     CLOSED,
@@ -86,7 +86,10 @@ class ProfileAssembler:
                 f"rows is {model.rows}; the reconstruction supports {ROW_LAST + 1} at most"
             )
         self._done: list[LineRows] = []
-        self._gate_us = settings.phase_gate_us
+        learned = settings.phase_gate_us == GATE_LEARNED
+        # A gate is learned from the rows of lines, which methods of full columns do not find.
+        alone = learned and settings.centroid in FULL_COLUMN_METHODS
+        self._gate_us = 0 if alone else settings.phase_gate_us
         self._first_choice = first_choice(settings)
         self._use(allocate(settings, model))
 

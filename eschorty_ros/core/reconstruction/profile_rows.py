@@ -45,8 +45,9 @@ from eschorty_ros.core.line.learned import (
 )
 from eschorty_ros.core.line.learned_gate import (
     LearnedGate,
-    _forget_gate,
+    _keep_gate,
     _learn_gate,
+    _restart_gate,
     _use_late,
     make_gate,
 )
@@ -244,10 +245,18 @@ def _begin_window(memory):
     memory.blink.lines[:] = 0.0
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
-    _forget_gate(memory.gate)
+    _restart_gate(memory.gate)
     _restart_widths(memory.smoothing.widths, memory.known_widths)
     if memory.footprint.state.near_edge == 0:
         _restart_from(memory.footprint, memory.known)
+
+
+@kernel
+def _forget_usual(widths, bursts):
+    """Forget what is usual of the widths of lines, and of their bursts."""
+    widths.usual.number[:], widths.below[:] = 0.0, 0.0
+    widths.history.shift_px[:] = 0.0
+    _forget_bursts(bursts)
 
 
 @kernel
@@ -318,7 +327,8 @@ def _close(memory):
     blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
     smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
     if gate.choices.size > 0:
-        _learn_gate(columns, state.half, gate)
+        if _learn_gate(columns, state.half, gate):
+            _forget_usual(smoothing.widths, memory.bursts)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
@@ -364,11 +374,11 @@ def _close(memory):
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            smoothing.widths.usual.number[:], history.shift_px[:] = 0.0, 0.0
-            _forget_bursts(memory.bursts)
+            _forget_usual(smoothing.widths, memory.bursts)
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)
+            _keep_gate(gate)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows

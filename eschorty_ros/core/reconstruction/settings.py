@@ -11,7 +11,6 @@ from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.line import (
     CENTROIDS,
-    FULL_COLUMN_METHODS,
     RETURNS,
     SIGMA_COMMON_PX,
     SIGMA_FLOOR_PX,
@@ -84,9 +83,9 @@ class Settings:
     keep: str = _choice("all", KEEP, "points to keep; good ones have no flag")
     noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
     phase_gate_us: int = _number(
-        0, GATE_LEARNED, GATE_MAX_US, "us",
+        GATE_LEARNED, GATE_LEARNED, GATE_MAX_US, "us",
         "keep only events this soon after their laser edge; 0 is off, -1 takes the time with which "
-        "rows scatter least",
+        "rows scatter least where it halves their variance",
     )  # fmt: skip
     trigger_source: str = _choice(
         "laser", TRIGGER_SOURCES,
@@ -199,11 +198,6 @@ class Settings:
             raise ArgumentError(
                 f"range_max is {self.range_max:g} m and range_min {self.range_min:g} m; choose a "
                 "larger range_max"
-            )
-        if self.phase_gate_us == GATE_LEARNED and self.centroid in FULL_COLUMN_METHODS:
-            raise ArgumentError(
-                f"phase_gate_us is -1, which follows the line, and centroid {self.centroid!r} uses "
-                "full columns; choose a time, or mode_mean"
             )
         if self.returns == "all" and self.organized == "on":
             raise ArgumentError(

@@ -529,9 +529,9 @@ def test_the_default_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_pa
     )
     error_mm = {}
     for name, settings in (
-        ("means", Settings(detail="off")),
-        ("learned", Settings(centroid="learned")),
-        ("chosen", Settings()),
+        ("means", Settings(detail="off", phase_gate_us=0)),
+        ("learned", Settings(centroid="learned", phase_gate_us=0)),
+        ("chosen", Settings(phase_gate_us=0)),
     ):
         found = reconstruct_recording(recording, settings).profiles
         stage_mm = recording.stage.position_mm(found.t_us)

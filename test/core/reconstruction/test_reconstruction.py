@@ -75,7 +75,7 @@ def _split_cases():
     )
     # Events that are late scatter more over the rows.
     slow = {"frequency_hz": 100.0, "periods": 40, "columns": 300}
-    prompt = line_events(rng, flat, **slow, edge_us=5000)
+    prompt = line_events(rng, flat, **slow, edge_us=5000, fwhm_px=8.0)
     late = line_events(rng, flat, **slow, edge_us=8000, events=8.0, fwhm_px=60.0)
     late = sort_readout(*map(np.concatenate, zip(prompt, late, strict=True)))
     edges = 5000 + np.arange(40) * 2000 + rng.integers(-20, 21, 40)
