@@ -522,7 +522,7 @@ def test_the_row_of_a_line_that_the_sensors_edge_cuts_is_that_of_the_full_line(e
         assert np.mean(np.abs(error) < found.sigma_row[near]) > 0.6
 
 
-def test_the_default_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_path):
+def test_auto_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_path):
     scene, sweep = Plane(slope_column=0.1), (10.0, 25.0, 50.0)
     recording = simulate_recording(
         tmp_path, scene, CALIBRATION, Modulation(70.0), *sweep, 1, parameters=preset("noisy")

@@ -133,6 +133,13 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
             assert a.counters == parallel.counters
 
 
+def test_lines_have_their_usual_width_where_a_gate_changes(monkeypatch):
+    """With windows of two or three profiles, each of which learns the gate."""
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
+    found, _ = reconstruct(*SPLIT_CASES["learned gate"])
+    assert np.mean(found.flags > 0) < 0.02, f"seed {SEED}"
+
+
 def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monkeypatch):
     """Learned in 10 profiles of 60, with windows of a dozen; half of the events are lost."""
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 400_000)
