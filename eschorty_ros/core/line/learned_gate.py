@@ -51,7 +51,8 @@ class LearnedGate(NamedTuple):
 
     All have the fields of a `PhaseGate`. The state is ``known`` once a choice is made, the first of
     which is no gate, and has ``changed`` if that is another than before; its ``late`` is the usual
-    number of late events of a column. Windows begin with the one that is ``kept``.
+    number of late events of a column, and ``half`` the half width of the windows of rows in which
+    it is chosen, 0 before. Windows begin with the one that is ``kept``.
     """
 
     state: Any
@@ -80,7 +81,7 @@ def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
 
 
 def _state(gate: PhaseGate) -> Any:
-    state = record(*PhaseGate._fields, "known", "changed", "late")
+    state = record(*PhaseGate._fields, "known", "changed", "late", "half")
     for name, value in gate._asdict().items():
         state[name] = value
     return state
@@ -88,8 +89,8 @@ def _state(gate: PhaseGate) -> Any:
 
 @kernel(_nrt=False)
 def _copy_gate(gate, other):
-    """Copy the parts of the period, and the usual number of late events, to another gate."""
-    other.step, other.late = gate.step, gate.late
+    """Copy the parts of the period, and what is usual with them, to another gate."""
+    other.step, other.late, other.half = gate.step, gate.late, gate.half
     other.on_begin, other.on_span = gate.on_begin, gate.on_span
     other.off_begin, other.off_span = gate.off_begin, gate.off_span
 
@@ -171,6 +172,9 @@ def _learn_gate(columns, half, gate):
     changed, state.changed = state.changed > 0, 0
     if state.known > 0:
         return changed
+    if state.half > 0:
+        # The gate in use has narrowed the windows, which leave out late events as well.
+        half = state.half
     row, gated = np.empty(columns.seeds.size), np.empty(columns.seeds.size)
     found = _fill_rows(columns, half, gate.choices[0], row)
     scatter = _median_difference(row)
@@ -187,7 +191,7 @@ def _learn_gate(columns, half, gate):
     choice = gate.choices[best]
     state.known, state.changed = 1, choice.on_span != state.on_span
     _copy_gate(choice, state)
-    state.late = _usual_late(columns, choice)
+    state.late, state.half = _usual_late(columns, choice), half
     return changed
 
 

@@ -24,7 +24,7 @@ from eschorty_ros.core.line.columns import (
     wider_columns,
 )
 from eschorty_ros.core.line.delay import Light, light
-from eschorty_ros.core.line.estimators import CENTROIDS, FULL_COLUMN_METHODS
+from eschorty_ros.core.line.estimators import FULL_COLUMN_METHODS
 from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
@@ -86,10 +86,11 @@ class ProfileAssembler:
                 f"rows is {model.rows}; the reconstruction supports {ROW_LAST + 1} at most"
             )
         self._done: list[LineRows] = []
-        learned = settings.phase_gate_us == GATE_LEARNED
-        # A gate is learned from the rows of lines, which methods of full columns do not find.
-        alone = learned and settings.centroid in FULL_COLUMN_METHODS
-        self._gate_us = 0 if alone else settings.phase_gate_us
+        self._gate_us = settings.phase_gate_us
+        self._takes_background = settings.centroid in FULL_COLUMN_METHODS
+        if self._takes_background and self._gate_us == GATE_LEARNED:
+            # It is learned from the rows of lines.
+            self._gate_us = 0
         self._first_choice = first_choice(settings)
         self._use(allocate(settings, model))
 
@@ -102,8 +103,8 @@ class ProfileAssembler:
         ``every`` is the number of periods in a profile.
         """
         lit = light(modulation, every)
-        if CENTROIDS[self._memory.estimator.method] in FULL_COLUMN_METHODS:
-            # They hold background, which comes at any time.
+        if self._takes_background:
+            # It comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
         self._use(
             self._memory._replace(
