@@ -140,6 +140,16 @@ def test_lines_have_their_usual_width_where_a_gate_changes(monkeypatch):
     assert np.mean(found.flags > 0) < 0.02, f"seed {SEED}"
 
 
+def test_later_windows_learn_the_gate_of_the_first(monkeypatch):
+    """The narrow width of its lines leaves out late events, too, so a gate seems to gain less."""
+    case = SPLIT_CASES["learned gate"]
+    _, one = reconstruct(*case)
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
+    _, many = reconstruct(*case)
+    gated = [reconstructor.counters["events_gated"] for reconstructor in (one, many)]
+    assert gated[1] > 0.9 * gated[0], f"seed {SEED}: {gated}"
+
+
 def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monkeypatch):
     """Learned in 10 profiles of 60, with windows of a dozen; half of the events are lost."""
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 400_000)
