@@ -64,13 +64,17 @@ class BlockMeans(NamedTuple):
 
 
 class PolarityMeans(NamedTuple):
-    """By block, how far rows of all events are from the middle of those of ON and OFF events.
+    """By block, how far rows of ON events are ``apart`` from those of OFF ones, and its square.
 
-    It is the mean over recent ``columns``.
+    The ``row`` is how far that of all events is from the middle of the two where the line moves.
+    They are means over recent columns: ``all_columns``, and ``columns`` where it moves.
     """
 
     row: NDArray[np.float64]
     columns: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    apart2: NDArray[np.float64]
+    all_columns: NDArray[np.float64]
 
 
 class LineHistory(NamedTuple):
@@ -101,7 +105,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((6, blocks)))
-    polarities = PolarityMeans(*np.zeros((2, blocks)))
+    polarities = PolarityMeans(*np.zeros((5, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(
         now, recent, polarities, step_px, shift_px, moved2, passing2, common_px, windowed
@@ -112,7 +116,8 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
 def _polarity_rows(packed, start, seed, half):
     """Return how far the row of a column's events is from the middle of those of ON and OFF ones.
 
-    NaN where one of the two is missing within ``half`` of the ``seed``.
+    The second value is how far these are apart. NaN where one of the two is missing within ``half``
+    of the ``seed``.
     """
     none = np.int64(0)
     on, off, on_rows, off_rows = none, none, none, none
@@ -127,20 +132,26 @@ def _polarity_rows(packed, start, seed, half):
         off_rows += row if inside & (not is_on) else none
         i += np.uintp(1)
     if min(on, off) == 0:
-        return np.nan
-    return (on_rows + off_rows) / (on + off) - 0.5 * (on_rows / on + off_rows / off)
+        return np.nan, np.nan
+    on_row, off_row = on_rows / on, off_rows / off
+    return (on_rows + off_rows) / (on + off) - 0.5 * (on_row + off_row), on_row - off_row
 
 
 @kernel(_nrt=False)
 def _compare_polarities(columns, half, first, history):
-    """Add one column of each block whose line moves, its ``first`` one, to the polarities."""
+    """Add one column of each block, its ``first`` one, to the polarities."""
     mean = history.polarities
     for block in range(1, mean.row.size - 1):
         c = np.uintp((block - 1) * BLOCK_COLUMNS + first)
-        if history.step_px[block] == 0.0 or c >= columns.seeds.size or columns.seeds[c] < 0:
+        if c >= columns.seeds.size or columns.seeds[c] < 0:
             continue
-        row = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
-        if not np.isnan(row):
+        row, apart = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
+        if np.isnan(row):
+            continue
+        mean.all_columns[block] = min(mean.all_columns[block] + 1.0, _PROFILES)
+        mean.apart[block] += (apart - mean.apart[block]) / mean.all_columns[block]
+        mean.apart2[block] += (apart * apart - mean.apart2[block]) / mean.all_columns[block]
+        if history.step_px[block] > 0.0:
             mean.columns[block] = min(mean.columns[block] + 1.0, _PROFILES)
             mean.row[block] += (row - mean.row[block]) / mean.columns[block]
 

@@ -4,13 +4,14 @@ The second difference of the rows of three columns is zero on a smooth surface, 
 is six variances of a single row, less what all of them share. Its ratio to what the estimator
 expects scales the expected variance: that of the columns' own rows, which sets the gates of
 smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
-remove.
+remove. No column is in the means of two of those, as texture moves the rows of near columns
+together. So far apart a surface curves: it is the third difference of four columns that is zero.
 
-What neighbours share over more columns no difference of rows shows, but the line does: its ends are
-whole pixels, each off by a twelfth of a squared row. The middle of two is off by that less a
-quarter of the variance of the length between them. Scatter of the ends dithers it. Pixels with
-more events than one at either edge of the laser have more levels of light that they count. Each
-level has ends of its own, and the row is the mean of all.
+What all columns share no difference of rows shows, but the line does: its ends are whole pixels,
+each off by a twelfth of a squared row. The middle of two is off by that less a quarter of the
+variance of the length between them. Scatter of the ends dithers it. Pixels with more events than
+one at either edge of the laser have more levels of light that they count. Each level has ends of
+its own, and so have ON and OFF events where their rows differ. The row is the mean of all.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ APART = 5
 # Columns of a block; the differences of a block and its two neighbours count for its points.
 BLOCK_COLUMNS = 16
 # Share of a profile's differences that the next keeps.
-_KEPT = 0.5
+_KEPT = 0.7
 # Differences without which the scatter near a block is not known.
 _DIFFERENCES_MIN = 8.0
+# The same for smoothed rows: a quarter of those of three blocks. Fewer are left near edges.
+_SMOOTHED_MIN = 24.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
-# A larger second difference is an edge of the surface, but where most are as large.
+# A larger second difference of rows is an edge of the surface, but where most are as large.
 _EDGE_PX = 4.0
 # Standard deviations beyond which a difference is an edge, or a neighbour is not averaged.
 _DEVIATIONS_MAX = 3.0
@@ -47,36 +50,35 @@ _SQUARE_PER_SIZE2 = 0.5 * np.pi
 
 
 class Differences(NamedTuple):
-    """Sums over profiles, by block: squared differences, what is expected, their sizes and number.
+    """Sums over profiles, by block: squared differences, what is expected, and their number.
 
-    ``lengths2`` are variances of the length of a line by the differences of lengths.
+    Of rows that are not smoothed ``sizes`` are those of differences, and ``lengths2`` variances of
+    the length of a line by the differences of lengths.
     """
 
     squares: NDArray[np.float64]
     expected: NDArray[np.float64]
+    number: NDArray[np.float64]
     sizes: NDArray[np.float64]
     lengths2: NDArray[np.float64]
-    number: NDArray[np.float64]
 
 
 class Scatter(NamedTuple):
     """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
 
-    A profile has so many edges of the laser as ``laser_edges``. Rows are means of one column
-    ``alone``.
+    A profile has so many edges of the laser as ``laser_edges``.
     """
 
     own: Differences
     smoothed: Differences
     factor_max: float
-    alone: NDArray[np.float64]
     laser_edges: int = 2
 
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK_COLUMNS) + 2))
-    return Scatter(Differences(*own), Differences(*smoothed), factor_max, np.ones(columns))
+    return Scatter(Differences(*own), Differences(*smoothed), factor_max)
 
 
 @kernel(inline="always")
@@ -97,21 +99,23 @@ def _forget_scatter(scatter):
         sums.number[:] = 0.0
 
 
-@kernel(_nrt=False)
-def _add_differences(row, sigma2, variance, averaged, sums, measures_lengths):
-    """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
+@kernel(inline="always")
+def _add(value, block, sums):
+    sums[block] = _KEPT * sums[block] + value
 
-    Differences above ``_EDGE_PX`` are left out: edges of the surface, but where most are as large.
+
+@kernel(_nrt=False)
+def _add_differences(row, sigma2, variance, sums):
+    """Add a profile's second differences of rows and of lengths to the sums.
+
+    Larger ones of rows than ``_EDGE_PX`` are left out: edges of the surface, but where most are as
+    large.
     """
-    columns = row.size
+    columns, apart = row.size, APART
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
+    largest = max(_EDGE_PX, _DEVIATIONS_MAX * usual)
     for block in range(1, sums.number.size - 1):
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
-        most = 1.0
-        for c in range(np.uintp(begin), np.uintp(end)):
-            most = max(most, averaged[c])
-        apart = max(APART, int(most) // 2 + 1)
-        largest = max(_EDGE_PX / np.sqrt(most), _DEVIATIONS_MAX * usual)
         first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
@@ -119,22 +123,58 @@ def _add_differences(row, sigma2, variance, averaged, sums, measures_lengths):
             difference = row[before] - 2.0 * row[c] + row[after]
             if abs(difference) <= largest:
                 squares += difference * difference
-                # Means of columns that overlap differ less.
-                shared = max(1.0 - apart / averaged[c], 0.0)
-                outer = sigma2[before] + sigma2[after]
-                expected += (1.0 - 4.0 / 3.0 * shared) * (outer + 4.0 * sigma2[c])
+                expected += sigma2[before] + sigma2[after] + 4.0 * sigma2[c]
                 number += 1.0
-                if measures_lengths:
-                    sizes += abs(difference)
-                    # The square of a length is 12 variances of evenly lit rows.
-                    wider = variance[before] - 2.0 * variance[c] + variance[after]
-                    length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
-                    lengths2 += min(length2, _LENGTH2_MAX) / 6.0
-        sums.squares[block] = _KEPT * sums.squares[block] + squares
-        sums.expected[block] = _KEPT * sums.expected[block] + expected
-        sums.sizes[block] = _KEPT * sums.sizes[block] + sizes
-        sums.lengths2[block] = _KEPT * sums.lengths2[block] + lengths2
-        sums.number[block] = _KEPT * sums.number[block] + number
+                # Of neighbours: few of them leap to the next pixel, texture moves both.
+                beside = row[c - np.uintp(1)] - 2.0 * row[c] + row[c + np.uintp(1)]
+                sizes += abs(difference) if np.isnan(beside) else min(abs(beside), largest)
+                # The square of a length is 12 variances of evenly lit rows.
+                wider = variance[before] - 2.0 * variance[c] + variance[after]
+                length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
+                lengths2 += min(length2, _LENGTH2_MAX) / 6.0
+        _add(squares, block, sums.squares)
+        _add(expected, block, sums.expected)
+        _add(number, block, sums.number)
+        _add(sizes, block, sums.sizes)
+        _add(lengths2, block, sums.lengths2)
+
+
+@kernel(inline="always")
+def _third(sigma2, i, j, k, m):
+    """Return the variance of the third difference of rows with variances ``sigma2``."""
+    return sigma2[i] + sigma2[m] + 9.0 * (sigma2[j] + sigma2[k])
+
+
+@kernel(_nrt=False)
+def _add_smoothed_differences(row, sigma2, averaged, own2, apart, sums):
+    """Add a profile's third differences of smoothed rows, so far ``apart``, to the sums.
+
+    Larger ones than rows with their ``own2`` variances have are left out, and means of less than
+    half as many columns, so ``averaged``, as the others: edges of the surface.
+    """
+    columns = row.size
+    # Of the four columns to the one in whose block their difference is.
+    before, after = apart + apart // 2, 2 * apart - apart // 2
+    for block in range(1, sums.number.size - 1):
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
+        squares, expected, number = 0.0, 0.0, 0.0
+        first, last = max(begin, before), min(end, columns - after)
+        for c in range(np.uintp(first), np.uintp(max(first, last))):
+            i = c - np.uintp(before)
+            j = i + np.uintp(apart)
+            k = j + np.uintp(apart)
+            m = k + np.uintp(apart)
+            difference = row[m] - row[i] - 3.0 * (row[k] - row[j])
+            square, largest2 = difference * difference, _third(own2, i, j, k, m)
+            least = min(averaged[i], averaged[j], averaged[k], averaged[m])
+            most = max(averaged[i], averaged[j], averaged[k], averaged[m])
+            if square <= _DEVIATIONS_MAX**2 * largest2 and 2.0 * least >= most:
+                squares += square
+                expected += _third(sigma2, i, j, k, m)
+                number += 1.0
+        _add(squares, block, sums.squares)
+        _add(expected, block, sums.expected)
+        _add(number, block, sums.number)
 
 
 @kernel
@@ -146,9 +186,9 @@ def _median_difference(row):
 
 
 @kernel(_nrt=False)
-def _ratio(sums, block, factor_max):
+def _ratio(sums, block, least, factor_max):
     """Return the ratio of the squares near a block to those expected; -1 where it is not known."""
-    if factor_max == 0.0 or _near_sum(sums.number, block) < _DIFFERENCES_MIN:
+    if factor_max == 0.0 or _near_sum(sums.number, block) < least:
         return -1.0
     ratio = _near_sum(sums.squares, block) / _near_sum(sums.expected, block)
     return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
@@ -172,16 +212,30 @@ def _levels(rows, begin, end, laser_edges):
 
 
 @kernel(_nrt=False)
-def _pixel_locking_variance(sums, block, levels):
+def _polarity_variance(polarities, block):
+    """Return the variance of the difference of ON from OFF rows near a block, 0 if not known."""
+    total, compared = 0.0, 0
+    for other in range(block - 1, block + 2):
+        total += polarities.apart2[other] - polarities.apart[other] ** 2
+        compared += polarities.all_columns[other] > 0.0
+    return total / max(compared, 1)
+
+
+@kernel(_nrt=False)
+def _pixel_locking_variance(sums, block, levels, apart2):
     """Return the variance that rows near a block share as the line's ends are whole pixels.
 
     A row is the mean of two ends for each of the levels, so that an end scatters by two of its
     variances for each. These follow from the mean size of differences: rows that leap to the next
-    pixel are no scatter. Scatter dithers the first harmonic of an end's error.
+    pixel are no scatter. Scatter dithers the first harmonic of an end's error. Rows of ON and OFF
+    events that differ by the variance ``apart2``, four times that of their mean where they are
+    independent, have levels of their own.
     """
     number = _near_sum(sums.number, block)
     size = _near_sum(sums.sizes, block) / number
-    end2 = 2.0 * levels * _SQUARE_PER_SIZE2 * size * size / 6.0
+    row2 = _SQUARE_PER_SIZE2 * size * size / 6.0
+    levels *= 1.0 + (min(0.25 * apart2 / row2, 1.0) if row2 > 0.0 else 0.0)
+    end2 = 2.0 * levels * row2
     middle2 = max(_WHOLE - 0.25 * _near_sum(sums.lengths2, block) / number, 0.0)
     return middle2 / levels * np.exp(-((2.0 * np.pi) ** 2) * end2)
 
@@ -194,13 +248,14 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, sums, True)
+    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], sums)
     for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, scatter.factor_max)
+        ratio = _ratio(sums, block, _DIFFERENCES_MIN, scatter.factor_max)
         measured = ratio >= 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
-        locking2 = _pixel_locking_variance(sums, block, levels) if measured else 0.0
+        apart2 = _polarity_variance(smoothing.widths.history.polarities, block)
+        locking2 = _pixel_locking_variance(sums, block, levels, apart2) if measured else 0.0
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         # Independent events scatter more than those of pixels, and bound what is not measured.
@@ -218,15 +273,22 @@ def _scale(rows, scatter, smoothing):
 
 @kernel(_nrt=False)
 def _scale_smoothed(rows, scatter, smoothing):
-    """Scale the smoothed variances of a profile by the scatter left; add what neighbours share."""
+    """Scale the smoothed variances of a profile by the scatter left.
+
+    They are no less than what all columns may share, which is in the scatter where the rows differ.
+    """
     returns, columns = rows.row.shape
     sums, sigma2 = scatter.smoothed, smoothing.sigma2
-    _add_differences(smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], sums, False)
+    apart = max(BLOCK_COLUMNS, 2 * smoothing.half_widths[-1] + 1)
+    row, used = smoothing.row[0], smoothing.used[0]
+    _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], apart, sums)
     for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, scatter.factor_max)
-        factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
+        ratio = _ratio(sums, block, _SMOOTHED_MIN, scatter.factor_max)
+        factor = min(ratio, scatter.factor_max)
         for k in range(returns):
             for c in range(
                 np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
             ):
-                sigma2[k, c] = rows.common2[k, c] + factor * sigma2[k, c]
+                own2, common2 = sigma2[k, c], rows.common2[k, c]
+                measured2 = max(common2, factor * own2)
+                sigma2[k, c] = measured2 if ratio >= 0.0 else common2 + own2

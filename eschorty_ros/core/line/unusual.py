@@ -132,6 +132,7 @@ def _restart_widths(widths, known):
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     recent.jitter2[:] = 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
+    polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
     history.shift_px[:] = 0.0
     _update(widths, widths.smoothed.shape[1])
@@ -246,7 +247,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     for k in range(returns):
         for c in range(columns):
             width, displacement = widths.static_width[k, c], row[k, c] - last_row[k, c]
-            own2 = sigma2[k, c] - rows.common2[k, c]
+            row2 = sigma2[k, c]
             sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
             weak = rows.events[k, c] < smoothing.isolation_events
@@ -258,7 +259,7 @@ def _mark_unusual(rows, smoothing, lit_share):
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths.below, width, reach):
-                steady = not displacement * displacement > _STEADY**2 * own2
+                steady = not displacement * displacement > _STEADY**2 * row2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]

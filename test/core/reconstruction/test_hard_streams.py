@@ -357,6 +357,15 @@ def test_sigma_of_pixels_with_many_events_is_not_that_of_whole_pixels(mismatch):
     assert np.mean(error < 2.0 * sigma) > 0.9
 
 
+@pytest.mark.parametrize("row", [350.0, 350.5])
+def test_sigma_of_pixels_with_thresholds_of_their_own_is_not_that_of_whole_pixels(row):
+    """The line's ends are others for ON and OFF events."""
+    camera = Camera(periods=16)
+    found, _ = points(camera, camera.line(lambda k, column: np.full(column.shape, row)))
+    error_px = np.sqrt(np.mean((found.row - row) ** 2))
+    assert np.median(found.sigma_row) < 2.0 * error_px, f"seed {camera.seed}"
+
+
 def _swapped(camera: Camera) -> Events:
     t, x, y, p = camera.line(wavy)
     return t, x, y, 1 - p
