@@ -9,8 +9,9 @@ middle is its uncertainty, up to the way of the line from profile to profile.
 Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
 Minus their mean product is the variance of the jumps; a way has none.
 
-A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
-missing at most. Means over blocks show changes that are too small to be seen in a column.
+A line that gets narrower or wider for a few profiles passes an edge, and is off by half of the rows
+that are missing, or new, at most. Means over blocks show changes that are too small to be seen in a
+column.
 """
 
 from __future__ import annotations
@@ -33,10 +34,9 @@ _PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
-# Most that an edge moves the row per change of the width: by half of the rows that are missing, or
-# by half of the gap in the middle of evenly lit rows.
-PER_NARROWER = np.sqrt(3.0)
-_PER_WIDER = 2.0 / np.sqrt(3.0)
+# Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
+# are missing, or by half of those that are new.
+PER_WIDTH = np.sqrt(3.0)
 
 
 class BlockSums(NamedTuple):
@@ -173,10 +173,10 @@ def _compare_with_recent(history, known, usual, width_variance):
         moved = row - recent.row[block]
         own2 = _near_sum(now.sigma2, block) / (points * points)
         moved2 = moved * moved - own2
-        narrower = min(recent.width[block], usual) - width
-        wider = width - max(recent.width[block], usual)
-        shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
-        passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
+        least, most = min(recent.width[block], usual), max(recent.width[block], usual)
+        changed = max(least - width, width - most, 0.0) if known else 0.0
+        width2 = width_variance / points
+        passing2 = PER_WIDTH**2 * (changed * changed - width2)
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
@@ -199,7 +199,9 @@ def _compare_with_recent(history, known, usual, width_variance):
         recent.last[block] = row
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
-        recent.width[block] += weight * (width - recent.width[block])
+        # What an edge that passes changes at once is no scatter, and counts little.
+        limit = _PROFILES / profiles * np.sqrt(width2) if known and profiles > 1.0 else np.inf
+        recent.width[block] += weight * max(min(width - recent.width[block], limit), -limit)
         recent.profiles[block] = profiles
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.line_history import (
-    PER_NARROWER,
+    PER_WIDTH,
     LineHistory,
     _compare_with_recent,
     empty_history,
@@ -152,7 +152,7 @@ def _unusual_variance(width, usual):
     A line with missing rows is off by half of them at most, one with more by what they scatter.
     """
     if width < usual:
-        return (PER_NARROWER * (usual - width)) ** 2
+        return (PER_WIDTH * (usual - width)) ** 2
     return width * width - usual * usual
 
 

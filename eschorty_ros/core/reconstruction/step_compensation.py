@@ -183,11 +183,9 @@ class StepCompensator:
         moved = shift_px != 0.0
         self.columns_compensated += int(np.count_nonzero(moved))
         added_px = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift_px), 0.0)
-        return replace(
-            profile,
-            row=profile.row - shift_px,
-            sigma_row=np.hypot(profile.sigma_row, added_px),
-        )
+        # Sigma may have what the edge moves the line by, which is taken off.
+        left2 = np.maximum(profile.sigma_row**2 - shift_px**2, 0.0)
+        return replace(profile, row=profile.row - shift_px, sigma_row=np.sqrt(left2 + added_px**2))
 
     def _lags(self, range_mm: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return profiles back and ahead until a step at the middle of the line has left it."""

@@ -1,11 +1,12 @@
-"""Sigma of a line that moves: rows of ON and OFF events that disagree show what it is off by."""
+"""Sigma of a line that moves, by the rows of ON and OFF events, or passes an edge, by its width."""
 
 import numpy as np
 import pytest
-from independent_pixels import Camera, stream, wavy
+from independent_pixels import ROWS, Camera, stream, wavy
 from reconstructing import reconstruct
 
 AHEAD_PX = 3.0
+ROW = 340.3
 
 
 def uneven_line(step_px: float, off_events: int):
@@ -40,3 +41,26 @@ def test_a_line_at_rest_and_even_polarities_have_no_such_sigma(step_px, off_even
     sigma_px = late_sigma_px(uneven_line(step_px, off_events))
     print(f"sigma {sigma_px:.2f} px")
     assert sigma_px < 0.2
+
+
+@pytest.mark.parametrize("step_px", [-0.5, 0.5], ids=["wider", "narrower"])
+def test_sigma_holds_what_an_edge_too_small_for_a_flag_moves(step_px):
+    """A step of half a row passes from one end of the line to the other in 20 profiles."""
+    camera, first, middle, last = Camera(periods=60), 25, 35, 45
+
+    def edge_px(k):
+        return 1.2 * (k - middle) if first <= k < last else ROWS * np.sign(k - middle)
+
+    def line(step, part):
+        return camera.line(lambda _, column: np.full(column.shape, ROW + step), part=part)
+
+    behind = line(0.0, lambda k: (edge_px(k), ROWS))
+    ahead = line(step_px, lambda k: (-ROWS, edge_px(k)))
+    found, _ = reconstruct(stream(behind, ahead))
+    passing = (found.period > first) & (found.period < last)
+    error_px = found.row - np.where(found.period < middle, ROW, ROW + step_px)
+    within = np.abs(error_px) < 2.0 * found.sigma_row
+    print(f"within 2 sigma: {np.mean(within[passing]):.3f}, seed {camera.seed}")
+    assert np.mean(within[passing]) > 0.88
+    assert np.median(found.sigma_row[passing]) < 0.25
+    assert np.median(found.sigma_row[found.period > last + 5]) < 0.1
