@@ -55,7 +55,8 @@ class ProfileLength:
     not depend on how the stream is split, nor on the background before the laser is on. A column
     counts by its pairs of events, which background has few of. One period is a profile where it has
     half of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the
-    default of ``events_min``. Else, or where periods are not even and more columns have less, a
+    default of ``events_min``. A column counts from its first period with events to its last one, as
+    surfaces begin and end. Else, or where periods are not even and more columns have less, a
     profile has as many periods as give `EVENTS_WANTED`, or the next number with which profiles are
     even: pixels that follow every third period give most events in two of three, and in periods
     shorter than a readout or a refractory time not those of the same rows. Where one period
@@ -163,8 +164,10 @@ class ProfileLength:
         of_column = counts.sum(axis=0)
         pairs = of_column * (of_column - 1)
         weights = pairs / max(pairs.sum(), 1)
-        events = max(float((counts @ weights).mean()), 1e-9)
-        few = np.mean((counts < EVENTS_WANTED // 4) @ weights)
+        seen = _between_events(counts)
+        weights /= np.maximum(seen.sum(axis=0), 1)
+        events = max(float(of_column @ weights), 1e-9)
+        few = (seen & (counts < EVENTS_WANTED // 4)).sum(axis=0) @ weights
         wanted = 1
         if events < enough or (few > _FEW_SHARE and not _are_even(in_period, 1)):
             wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
@@ -173,6 +176,13 @@ class ProfileLength:
         if self._modulation.period_us < PERIOD_MIN_US:
             even = _with_even_rows(even, counts, sums)
         return next(iter(even), wanted)
+
+
+def _between_events(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return the periods from the first to the last in which a column has events."""
+    some = counts > 0
+    later = np.logical_or.accumulate(some[::-1])[::-1]
+    return np.logical_or.accumulate(some) & later
 
 
 def _are_even(in_period: NDArray[np.int64], periods: int) -> bool:

@@ -513,6 +513,19 @@ def test_a_recording_of_two_periods_has_two_profiles():
     assert not reconstructor.warnings
 
 
+@pytest.mark.parametrize("growth", [1.7, 0.6])
+def test_a_surface_that_begins_or_ends_leaves_a_profile_one_period(growth):
+    """Columns that are lit in a part of the first periods have enough events in those."""
+    camera = Camera(periods=12)
+    lit = 32 if growth > 1.0 else 1280
+
+    def row(k, column):
+        return np.where(37 * column % 1280 < lit * growth**k, 340.3, np.nan)
+
+    _, reconstructor = points(camera, camera.line(row), periods_per_profile=0)
+    assert reconstructor.periods_per_profile == 1, f"seed {camera.seed}"
+
+
 def _sloping(towards: float):
     return lambda k, c: np.abs(towards - 3.0 - 0.06 * c) + 0.0 * k
 
