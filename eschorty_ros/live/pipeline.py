@@ -36,7 +36,7 @@ _STAGE_BEFORE_US = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
-    """An assembled scan, and the losses while it was collected."""
+    """An assembled scan, the losses while it was collected, and the stream's ``warnings``."""
 
     scan: AssembledScan
     events: int
@@ -48,6 +48,7 @@ class ScanReport:
     points_over_limit: int
     profiles_expected: int
     frequency_hz: float
+    warnings: tuple[str, ...] = ()
     pass_lag: PassLag | None = None
 
     @property
@@ -63,7 +64,7 @@ class ScanReport:
 
     @property
     def message(self) -> str:
-        """Return the losses, or the cause of an empty scan; ``""`` when nothing was lost."""
+        """Return the losses and warnings, or the cause of an empty scan; else ``""``."""
         notes = []
         if self.points_without_stage:
             notes.append(f"{self.points_without_stage} points had no stage position")
@@ -78,6 +79,8 @@ class ScanReport:
                 f"{self.scan.profiles} profiles of {self.profiles_expected} between start and "
                 f"stop; {self.points_outside} points are outside"
             )
+        if len(self.scan.points):
+            notes += self.warnings
         return "; ".join(notes)
 
     def _cause_of_empty(self) -> str:
@@ -281,6 +284,7 @@ class Pipeline:
             points_over_limit=buffer.points_over_limit,
             profiles_expected=self._coverage.profiles(self.stream.profile_rate_hz),
             frequency_hz=self.stream.frequency_hz,
+            warnings=tuple(self.stream.warnings),
             pass_lag=lag,
         )
 

@@ -475,3 +475,18 @@ def test_profiles_that_wait_for_the_stage_as_a_scan_begins_are_not_of_it():
     report = pipeline.end_scan()
     assert report.points_outside >= waiting
     assert 0 < len(report.scan.points) == len(plain(data)) - report.points_outside
+
+
+def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
+    pipeline = Pipeline(CALIBRATION, Settings(line_width_px=6.0), 1.0, 0.0, 6.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+    pipeline.begin_scan("s", 0.0, 1.0)
+    for packet in packets(line()):
+        pipeline.add_packet(packet, 0.0)
+    pipeline.process(0.0)
+    for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
+        pipeline.add_stage(at_ns, 0.5)
+    pipeline.close_period("s", 0.0)
+    pipeline.place(0.0)
+    assert "as wide as line_width_px = 6" in pipeline.end_scan().message
