@@ -453,6 +453,15 @@ def test_a_packet_whose_time_runs_on_is_refused():
     check_span(line())
 
 
+def ended(pipeline):
+    """Return the report of a scan under way, with the stage at 0.5 mm all the time."""
+    for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
+        pipeline.add_stage(at_ns, 0.5)
+    pipeline.close_period("s", 0.0)
+    pipeline.place(0.0)
+    return pipeline.end_scan()
+
+
 def test_profiles_that_wait_for_the_stage_as_a_scan_begins_are_not_of_it():
     data = line()
     pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 6.0)
@@ -468,11 +477,7 @@ def test_profiles_that_wait_for_the_stage_as_a_scan_begins_are_not_of_it():
     for packet in parts[4:]:
         pipeline.add_packet(packet, 0.0)
     pipeline.process(0.0)
-    for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
-        pipeline.add_stage(at_ns, 0.5)
-    pipeline.close_period("s", 0.0)
-    pipeline.place(0.0)
-    report = pipeline.end_scan()
+    report = ended(pipeline)
     assert report.points_outside >= waiting
     assert 0 < len(report.scan.points) == len(plain(data)) - report.points_outside
 
@@ -485,8 +490,4 @@ def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
     for packet in packets(line()):
         pipeline.add_packet(packet, 0.0)
     pipeline.process(0.0)
-    for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
-        pipeline.add_stage(at_ns, 0.5)
-    pipeline.close_period("s", 0.0)
-    pipeline.place(0.0)
-    assert "as wide as line_width_px = 6" in pipeline.end_scan().message
+    assert "as wide as line_width_px = 6" in ended(pipeline).message
