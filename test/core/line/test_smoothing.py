@@ -104,15 +104,15 @@ def test_sigma_is_the_scatter_of_the_columns(scatter_px):
     assert np.sqrt(np.mean(inner**2)) == pytest.approx(row.std(), rel=0.1)
 
 
-@pytest.mark.parametrize("together", [3, 6, 12])
-def test_sigma_has_what_near_columns_share(together):
+@pytest.mark.parametrize(("together", "least"), [(3, 0.9), (6, 0.8), (12, 0.8)])
+def test_sigma_has_what_near_columns_share(together, least):
     rng = np.random.default_rng(8)
     row = 300 + 0.25 * np.repeat(np.rint(rng.normal(0.0, 1.2, 1280 // together)), together)
     out, sigma = smoothed(row)
     inner = slice(100, -100)
     scatter_px = np.sqrt(np.mean((out[inner] - 300.0) ** 2))
     sigma_px = np.sqrt(np.mean(sigma[inner] ** 2 - COMMON_PX**2))
-    assert 0.8 < sigma_px / scatter_px < 1.1, "seed 8"
+    assert least < sigma_px / scatter_px < 1.1, "seed 8"
 
 
 def test_a_curved_surface_is_no_scatter():
