@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK_COLUMNS, _near_sum
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.window import (
     _ONE,
     _ONE_BITS,

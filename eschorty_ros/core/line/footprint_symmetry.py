@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import _WHOLE
+from eschorty_ros.core.line.pixel_locking import _WHOLE
 
 # Places per row.
 _PLACES = 8

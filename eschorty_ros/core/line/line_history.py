@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK_COLUMNS, _near_sum
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
 # Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.

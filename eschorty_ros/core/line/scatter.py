@@ -6,12 +6,6 @@ expects scales the expected variance: that of the columns' own rows, which sets 
 smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
 remove. No column is in the means of two of those, as texture moves the rows of near columns
 together. So far apart a surface curves: it is the third difference of four columns that is zero.
-
-What all columns share no difference of rows shows, but the line does: its ends are whole pixels,
-each off by a twelfth of a squared row. The middle of two is off by that less a quarter of the
-variance of the length between them. Scatter of the ends dithers it. Pixels with more events than
-one at either edge of the laser have more levels of light that they count. Each level has ends of
-its own, and so have ON and OFF events where their rows differ. The row is the mean of all.
 """
 
 from __future__ import annotations
@@ -22,11 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
+from eschorty_ros.core.line.pixel_locking import (
+    _WHOLE,
+    _levels,
+    _pixel_locking_variance,
+    _polarity_variance,
+)
 
 # Columns from one to the next of those whose rows, or widths, are compared.
 APART = 5
-# Columns of a block; the differences of a block and its two neighbours count for its points.
-BLOCK_COLUMNS = 16
 # Share of a profile's differences that the next keeps.
 _KEPT = 0.7
 # Differences without which the scatter near a block is not known.
@@ -41,12 +40,8 @@ _EDGE_PX = 4.0
 _DEVIATIONS_MAX = 3.0
 # Largest factor of a variance, and one over the least.
 FACTOR_MAX = 64.0
-# Variance of a whole pixel.
-_WHOLE = 1.0 / 12.0
 # Largest square of a second difference of lengths that are one of two numbers of pixels.
 _LENGTH2_MAX = 4.0
-# Mean square of a normal distribution over that of its mean size.
-_SQUARE_PER_SIZE2 = 0.5 * np.pi
 
 
 class Differences(NamedTuple):
@@ -79,13 +74,6 @@ def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK_COLUMNS) + 2))
     return Scatter(Differences(*own), Differences(*smoothed), factor_max)
-
-
-@kernel(inline="always")
-def _near_sum(sums, block):
-    """Return the sum over a block and its two neighbours."""
-    b = np.uintp(block)
-    return sums[b - np.uintp(1)] + sums[b] + sums[b + np.uintp(1)]
 
 
 @kernel
@@ -192,52 +180,6 @@ def _ratio(sums, block, least, factor_max):
         return -1.0
     ratio = _near_sum(sums.squares, block) / _near_sum(sums.expected, block)
     return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
-
-
-@kernel(_nrt=False)
-def _levels(rows, begin, end, laser_edges):
-    """Return the mean number of levels that the pixels of columns count at an edge of the laser.
-
-    Each level needs two ends of its own, so there are at most half as many as lit rows.
-    """
-    events, length, number = 0.0, 0.0, 0.0
-    for k in range(rows.row.shape[0]):
-        for c in range(np.uintp(begin), np.uintp(end)):
-            found = not np.isnan(rows.row[k, c])
-            events += rows.events[k, c] if found else 0.0
-            length += np.sqrt(rows.variance[k, c] / _WHOLE) if found else 0.0
-            number += 1.0 if found else 0.0
-    levels = events / (laser_edges * max(length, 1.0))
-    return max(min(levels, 0.5 * length / max(number, 1.0)), 1.0)
-
-
-@kernel(_nrt=False)
-def _polarity_variance(polarities, block):
-    """Return the variance of the difference of ON from OFF rows near a block, 0 if not known."""
-    total, compared = 0.0, 0
-    for other in range(block - 1, block + 2):
-        total += polarities.apart2[other] - polarities.apart[other] ** 2
-        compared += polarities.all_columns[other] > 0.0
-    return total / max(compared, 1)
-
-
-@kernel(_nrt=False)
-def _pixel_locking_variance(sums, block, levels, apart2):
-    """Return the variance that rows near a block share as the line's ends are whole pixels.
-
-    A row is the mean of two ends for each of the levels, so that an end scatters by two of its
-    variances for each. These follow from the mean size of differences: rows that leap to the next
-    pixel are no scatter. Scatter dithers the first harmonic of an end's error. Rows of ON and OFF
-    events that differ by the variance ``apart2``, four times that of their mean where they are
-    independent, have levels of their own.
-    """
-    number = _near_sum(sums.number, block)
-    size = _near_sum(sums.sizes, block) / number
-    row2 = _SQUARE_PER_SIZE2 * size * size / 6.0
-    levels *= 1.0 + (min(0.25 * apart2 / row2, 1.0) if row2 > 0.0 else 0.0)
-    end2 = 2.0 * levels * row2
-    middle2 = max(_WHOLE - 0.25 * _near_sum(sums.lengths2, block) / number, 0.0)
-    return middle2 / levels * np.exp(-((2.0 * np.pi) ** 2) * end2)
 
 
 @kernel(_nrt=False)

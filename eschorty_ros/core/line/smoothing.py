@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths
 
 # Columns to either side in which a weak point needs a neighbour.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.line_history import (
     PER_WIDTH,
     LineHistory,
@@ -21,7 +22,7 @@ from eschorty_ros.core.line.line_history import (
     empty_history,
 )
 from eschorty_ros.core.line.reflectance import ROOT_12
-from eschorty_ros.core.line.scatter import APART, BLOCK_COLUMNS
+from eschorty_ros.core.line.scatter import APART
 
 # Widths that are told apart, per row and in all.
 _PER_ROW = 16

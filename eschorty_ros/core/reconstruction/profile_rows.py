@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blinking import Blink, _add_lines
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.burst_shift import (
     Bursts,
     _compare_bursts,
@@ -53,7 +54,6 @@ from eschorty_ros.core.line.learned_gate import (
 )
 from eschorty_ros.core.line.line_history import _compare_polarities
 from eschorty_ros.core.line.scatter import (
-    BLOCK_COLUMNS,
     FACTOR_MAX,
     Scatter,
     _forget_scatter,
