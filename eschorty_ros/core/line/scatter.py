@@ -19,6 +19,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.pixel_locking import (
     _WHOLE,
+    LineEnds,
     _levels,
     _pixel_locking_variance,
     _polarity_variance,
@@ -45,26 +46,22 @@ _LENGTH2_MAX = 4.0
 
 
 class Differences(NamedTuple):
-    """Sums over profiles, by block: squared differences, what is expected, and their number.
-
-    Of rows that are not smoothed ``sizes`` are those of differences, and ``lengths2`` variances of
-    the length of a line by the differences of lengths.
-    """
+    """Sums over profiles, by block: squared differences, what is expected, and their number."""
 
     squares: NDArray[np.float64]
     expected: NDArray[np.float64]
     number: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    lengths2: NDArray[np.float64]
 
 
 class Scatter(NamedTuple):
     """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
 
-    A profile has so many edges of the laser as ``laser_edges``.
+    ``ends`` are of the differences ``own``. A profile has so many edges of the laser as
+    ``laser_edges``.
     """
 
     own: Differences
+    ends: LineEnds
     smoothed: Differences
     factor_max: float
     laser_edges: int = 2
@@ -72,8 +69,10 @@ class Scatter(NamedTuple):
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
-    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK_COLUMNS) + 2))
-    return Scatter(Differences(*own), Differences(*smoothed), factor_max)
+    blocks = -(-columns // BLOCK_COLUMNS) + 2
+    own, smoothed = np.zeros((2, len(Differences._fields), blocks))
+    ends = np.zeros((len(LineEnds._fields), blocks))
+    return Scatter(Differences(*own), LineEnds(*ends), Differences(*smoothed), factor_max)
 
 
 @kernel
@@ -82,18 +81,19 @@ def _forget_scatter(scatter):
     for sums in (scatter.own, scatter.smoothed):
         sums.squares[:] = 0.0
         sums.expected[:] = 0.0
-        sums.sizes[:] = 0.0
-        sums.lengths2[:] = 0.0
         sums.number[:] = 0.0
+    scatter.ends.sizes[:] = 0.0
+    scatter.ends.lengths2[:] = 0.0
 
 
 @kernel(inline="always")
 def _add(value, block, sums):
+    """Add a profile's sum over a block to the share kept of those before."""
     sums[block] = _KEPT * sums[block] + value
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, variance, sums):
+def _add_differences(row, sigma2, variance, sums, ends):
     """Add a profile's second differences of rows and of lengths to the sums.
 
     Larger ones of rows than ``_EDGE_PX`` are left out: edges of the surface, but where most are as
@@ -123,8 +123,8 @@ def _add_differences(row, sigma2, variance, sums):
         _add(squares, block, sums.squares)
         _add(expected, block, sums.expected)
         _add(number, block, sums.number)
-        _add(sizes, block, sums.sizes)
-        _add(lengths2, block, sums.lengths2)
+        _add(sizes, block, ends.sizes)
+        _add(lengths2, block, ends.lengths2)
 
 
 @kernel(inline="always")
@@ -190,14 +190,16 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], sums)
+    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], sums, scatter.ends)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, _DIFFERENCES_MIN, scatter.factor_max)
         measured = ratio >= 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
         apart2 = _polarity_variance(smoothing.widths.history.polarities, block)
-        locking2 = _pixel_locking_variance(sums, block, levels, apart2) if measured else 0.0
+        locking2 = 0.0
+        if measured:
+            locking2 = _pixel_locking_variance(scatter.ends, sums.number, block, levels, apart2)
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         # Independent events scatter more than those of pixels, and bound what is not measured.
