@@ -12,6 +12,8 @@ from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure
 
 _TICK_S = 0.02
 _NOTED_S = 0.5
+# The pace of a reconstruction that gets its events in lumps is known after this time.
+_PACE_KNOWN_S = 5.0
 
 
 class PacedWaiting:
@@ -85,17 +87,20 @@ class PacedWaiting:
 
     def drain(self, no_progress_s: float, within_s: float) -> None:
         """See ``Instrument``."""
-        target_ns = self._now_ns()
-        end_s = time.monotonic() + within_s
+        target_ns, begun_ns = self._now_ns(), self.monitor.until_ns
+        begun_s = time.monotonic()
         while self.monitor.until_ns < target_ns:
             self.tick()
             self.monitor.check_reconstruction()
             self.monitor.check_progress(no_progress_s)
-            if time.monotonic() > end_s:
-                behind_s = (target_ns - self.monitor.until_ns) * 1e-9
+            elapsed_s = time.monotonic() - begun_s
+            behind_ns = target_ns - self.monitor.until_ns
+            rest_s = elapsed_s * behind_ns / max(self.monitor.until_ns - begun_ns, 1)
+            if rest_s > within_s and elapsed_s > min(_PACE_KNOWN_S, within_s):
                 raise ScanFailure(
-                    f"reconstruction: {behind_s:.1f} s behind the end of the sweep after "
-                    f"{within_s:.0f} s; look at the computer's load and at the hosts' clocks"
+                    f"reconstruction: {behind_ns * 1e-9:.1f} s behind the end of the sweep, "
+                    f"{rest_s:.0f} s more at its pace; look at the computer's load and at the "
+                    "hosts' clocks, shorten the sweep, or choose a lower frequency"
                 )
 
     def collect(self, duration_s: float) -> None:

@@ -15,8 +15,8 @@ from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 from eschorty_ros.live.sweep_coverage import COMPLETE, PASSES_MAX
 
 _FAILED_DRAIN_S = 5.0
-# Longest time for the end of a scan per second of its sweep, on a computer that falls behind.
-_DRAIN_PER_S = 200.0
+# Longest time for the end of a scan on a computer that falls behind.
+_DRAIN_S = 1800.0
 SPEED_MIN_MM_S = 0.05
 """Least speed of a scan or move: between two statuses a slower stage seems to rest."""
 
@@ -169,7 +169,11 @@ class Instrument(Protocol):
         """From here on no tick raises ``ScanCanceled``."""
 
     def drain(self, no_progress_s: float, within_s: float) -> None:
-        """Wait until the reconstruction has passed the present time; both limits fail the scan."""
+        """Wait until the reconstruction has passed the present time.
+
+        The scan fails when it makes no progress for ``no_progress_s``, or when the rest would take
+        longer than ``within_s`` at its pace.
+        """
 
     def report(self, phase: str) -> None:
         """Name the phase in the feedback."""
@@ -342,8 +346,7 @@ def _finish(
     # After a failure the last events are kept, without a long wait for a camera that may be lost.
     failed = outcome.end is End.ABORTED
     timeout_s = 1.0 if failed else limits.drain_timeout_s
-    sweep_s = request.passes * abs(request.stop_mm - request.start_mm) / request.speed_mm_s
-    within_s = _FAILED_DRAIN_S if failed else limits.drain_timeout_s + _DRAIN_PER_S * sweep_s
+    within_s = _FAILED_DRAIN_S if failed else _DRAIN_S
     outcome.attempt(lambda: instrument.drain(timeout_s, within_s))
 
     def end_scan() -> None:

@@ -33,6 +33,10 @@ _PACKET_MIN_US = 1_000
 _AT_ONCE_US = 16_000
 # Those of a dark scene leave together, too.
 _DARK_US = 32_000
+# Sensor time of the first simulation behind a change, and time that later ones may take: reads
+# of a camera whose bench is late are not held up.
+_FIRST_US = 200
+_BUSY_S = 0.05
 _SLEEP_MIN_S = 1e-4
 _PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
@@ -145,7 +149,9 @@ class Physics:
         self._stage_edges: deque[tuple[int, bool]] = deque()
         self._collected_ns = 0
         self._in_transit: deque[tuple[int, bytes]] = deque()
-        self._rest = b""
+        self._packet = self._rest = b""
+        self._packet_end_us = 0
+        self._at_once_us = _FIRST_US
         self._running = threading.Event()
 
     def set_laser(self, since_ns: int, on: bool, modulation: Modulation | None) -> None:
@@ -197,7 +203,8 @@ class Physics:
             self._apply_plan(world, self._plan)
             world.set_sensor(0, self._control.control)
             self._in_transit.clear()
-            self._rest = b""
+            self._packet = self._rest = b""
+            self._packet_end_us = 0
             self._running.set()
 
     def stop(self) -> None:
@@ -210,8 +217,10 @@ class Physics:
         while True:
             with self._simulating:
                 if self._running.is_set():
+                    begun_s = time.monotonic()
                     while self._simulate() and not self._in_transit:
-                        pass
+                        if time.monotonic() > max(deadline_s, begun_s + _BUSY_S):
+                            break
                     self._deliver()
                 data, self._rest = self._rest[:max_bytes], self._rest[max_bytes:]
             left_s = deadline_s - time.monotonic()
@@ -239,17 +248,17 @@ class Physics:
         world = self._world
         if world is None or not self._running.is_set():
             return _PACKET_MIN_US * 1e-6
-        due_ns = self._zero_ns + self._bench_ns(world.now_us + self._step_us)
+        due_ns = self._zero_ns + self._bench_ns(self._packet_end_us + self._step_us(world))
         if self._in_transit:
             due_ns = min(due_ns, self._in_transit[0][0])
         return max(due_ns - self.clock_ns(), 0) * 1e-9 + _SLEEP_MIN_S
 
-    @property
-    def _step_us(self) -> int:
-        return max(self.packet_us, _PACKET_MIN_US if self._light.on else _DARK_US)
+    def _step_us(self, world: World) -> int:
+        dark = not self._light.on and self._sensor_us(self._light.since_ns) <= world.now_us
+        return max(self.packet_us, _DARK_US if dark else _PACKET_MIN_US)
 
     def _simulate(self) -> bool:
-        """Advance the world by some packets at most; returns whether it advanced."""
+        """Advance the world by some packets, or part of one; returns whether it advanced."""
         world = self._world
         assert world is not None
         with self.lock:
@@ -257,6 +266,8 @@ class Physics:
             horizon_ns = self.clock_ns()
             changes = list(self._changes)
             self._changes.clear()
+        if changes:
+            self._at_once_us = _FIRST_US
         for change in changes:
             if isinstance(change, _Light):
                 self._apply_light(world, change)
@@ -264,15 +275,22 @@ class Physics:
                 world.set_sensor(self._from_us(world, change.since_ns), change.control)
             else:
                 self._apply_plan(world, change)
-        step_us = self._step_us
-        packets = (self._sensor_us(horizon_ns) - world.now_us) // step_us
-        if packets < 1:
-            return False
-        data = world.advance(world.now_us + min(packets, max(_AT_ONCE_US // step_us, 1)) * step_us)
+        if world.now_us == self._packet_end_us:
+            step_us = self._step_us(world)
+            packets = (self._sensor_us(horizon_ns) - world.now_us) // step_us
+            if packets < 1:
+                return False
+            self._packet_end_us += min(packets, max(self._at_once_us // step_us, 1)) * step_us
+        begun_s, from_us = time.monotonic(), world.now_us
+        self._packet += world.advance(min(from_us + self._at_once_us, self._packet_end_us))
+        pace_us = (world.now_us - from_us) / max(time.monotonic() - begun_s, 1e-6)
+        at_once_us = min(round(_BUSY_S * pace_us), 2 * self._at_once_us, _AT_ONCE_US)
+        self._at_once_us = max(at_once_us, _FIRST_US)
         self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(world.now_us)
-        if data:
+        if self._packet and world.now_us == self._packet_end_us:
             late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)
-            self._in_transit.append((horizon_ns + late_ns, data))
+            self._in_transit.append((horizon_ns + late_ns, self._packet))
+            self._packet = b""
         return True
 
     def _deliver(self) -> None:

@@ -1,6 +1,7 @@
 """The bench's physics: laser, stage and sensor, each with its clock, without device models."""
 
 import random
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -207,6 +208,33 @@ def test_bytes_that_come_late_know_by_how_much() -> None:
     assert late_ns[0] > 400 * MS
     # The packets of a dark scene come together.
     assert 0 <= late_ns[-1] < 32 * MS
+
+
+def test_reads_end_although_a_packet_takes_long_to_simulate() -> None:
+    modulation = Modulation(5000.0)
+
+    def bytes_of(make: Callable[[], World]) -> tuple[list[bytes], Physics]:
+        clock, physics = started(make=make)
+        physics.set_laser(clock.now_ns, True, modulation)
+        clock.now_ns += 8 * MS
+        return [physics.read(1 << 20, 0.0) for _ in range(60)], physics
+
+    def slow() -> World:
+        made = world()
+        advance = made.advance
+
+        def late(until_us: int) -> bytes:
+            time.sleep((until_us - made.now_us) * 20e-6)
+            return advance(until_us)
+
+        made.advance = late  # type: ignore[method-assign]
+        return made
+
+    reads, physics = bytes_of(slow)
+    # 20 ms per period, so that a read ends before a packet of 4 ms does; its bytes come whole.
+    assert reads[0] == b""
+    assert b"".join(reads) == b"".join(bytes_of(world)[0]) != b""
+    assert physics.read(1 << 20, 0.0) == b""
 
 
 def test_late_changes_are_counted() -> None:
