@@ -286,7 +286,7 @@ class Physics:
         pace_us = (world.now_us - from_us) / max(time.monotonic() - begun_s, 1e-6)
         at_once_us = min(round(_BUSY_S * pace_us), 2 * self._at_once_us, _AT_ONCE_US)
         self._at_once_us = max(at_once_us, _FIRST_US)
-        self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(world.now_us)
+        self.late_ns = self.clock_ns() - self._zero_ns - self._bench_ns(world.now_us)
         if self._packet and world.now_us == self._packet_end_us:
             late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)
             self._in_transit.append((horizon_ns + late_ns, self._packet))

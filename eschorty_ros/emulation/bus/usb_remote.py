@@ -212,9 +212,11 @@ class RemoteBackend(DescriptorBackend):
     ) -> int:
         """Receive a transfer into ``buff``; returns the bytes received."""
         view, link = memoryview(buff).cast("B"), dev_handle.link(ep)
-        size = link.call(Op.READ, (ep, len(view), timeout), timeout_ms=timeout, into=view)
-        self._late_ns = link.late_ns
-        return int(size)
+        try:
+            return int(link.call(Op.READ, (ep, len(view), timeout), timeout_ms=timeout, into=view))
+        finally:
+            # A read without data has its time, too.
+            self._late_ns = link.late_ns
 
     def transfer_clock(self, clock_ns: Callable[[], int]) -> Callable[[], int]:
         """Return the clock by which the last transfer read would have come from a real device.

@@ -100,7 +100,7 @@ class UsbServer:
                 try:
                     answer = session.run(op, numbers, data)
                 except usb.core.USBError as error:
-                    send_answer(link, error.errno or errno.ENODEV)
+                    send_answer(link, error.errno or errno.ENODEV, late_ns=session.late_ns)
                 else:
                     send_answer(link, 0, answer, session.late_ns)
         except (Closed, OSError):
@@ -171,9 +171,10 @@ class _Session:
         if size > len(self._buffer):
             self._buffer = memoryview(bytearray(size))
         into = self._buffer[:size]
-        count = self._backend.bulk_read(handle, endpoint, 0, into, timeout)
-        self.late_ns = handle.device.late_ns
-        return into[:count]
+        try:
+            return into[: self._backend.bulk_read(handle, endpoint, 0, into, timeout)]
+        finally:
+            self.late_ns = handle.device.late_ns
 
     def _control(
         self, handle: Handle, numbers: tuple[int, int, int, int], data: bytearray

@@ -112,7 +112,11 @@ class Evk4Model(EmulatedUsbDevice):
     def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
         """Send an answer or the next packet of events."""
         if endpoint == DATA_IN and self.watch.phase is Phase.STREAMING:
+            begun_s = time.monotonic()
             self._pull(timeout_ms / 1e3)
+            # For libusb 0 ms is unlimited.
+            left_ms = timeout_ms - round((time.monotonic() - begun_s) * 1e3)
+            timeout_ms = max(left_ms, 1) if timeout_ms else 0
         return super().bulk_in(endpoint, size, timeout_ms)
 
     def read(self, address: int) -> int:
