@@ -373,7 +373,9 @@ class Reconstructor:
         line = counts["events_binned"] - counts["events_unmodulated"]
         dark = 2 * counts["events_unmodulated"] * points < line * unmodulated
         dark &= unmodulated < 10 * points
-        if share > _UNMODULATED_SHARE and not dark:
+        # As the laser is switched on, and off, a period has no phase.
+        switched = 2 * columns if points else 0
+        if share > _UNMODULATED_SHARE and not dark and unmodulated > switched:
             found.append(
                 f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "

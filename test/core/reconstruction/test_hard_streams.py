@@ -400,6 +400,19 @@ def test_a_stream_without_points_has_a_reason(case):
     assert len(warning) < 300
 
 
+@pytest.mark.parametrize(("periods", "warned"), [(2, False), (4, True)])
+def test_a_laser_that_is_switched_on_and_off_has_no_warning(periods, warned):
+    """The events of as many periods come at any time; a short scan has few others."""
+    camera = Camera(periods=16)
+    t, x, y, p = camera.line(wavy)
+    any_us = FIRST_EDGE_US + camera.rng.uniform(0.0, periods * camera.period_us, t.size)
+    t = np.where(t < FIRST_EDGE_US + periods * camera.period_us, any_us.astype(t.dtype), t)
+    found, reconstructor = points(camera, (t, x, y, p))
+    expected = CALIBRATION.columns * (camera.periods - periods)
+    assert len(found) > 0.9 * expected, f"seed {camera.seed}"
+    assert any("do not follow" in line for line in reconstructor.warnings) == warned
+
+
 def test_a_readout_that_reports_lost_events_has_a_warning():
     camera = Camera(periods=4)
     data = stream(camera.line(wavy)) + np.array([0xEEDA], "<u2").tobytes()
