@@ -111,7 +111,7 @@ def accuracy_rows(measured: Accuracy) -> dict[str, str]:
     """Return a cloud's errors as rows of a table."""
     return {
         "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
-        "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
+        "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole profiles",
         "median |range error|": f"{measured.error_median_mm:.3f} mm",
         "95th percentile": f"{measured.error_p95_mm:.3f} mm",
         "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, {measured.within_2_sigma:.1%}",

@@ -67,7 +67,7 @@ class Accuracy:
     """A cloud against its scene."""
 
     periods: int
-    """Modulation periods entirely within the sweep."""
+    """Modulation periods, or profiles of several, entirely within the sweep."""
     points: int
     """All points of the cloud."""
     completeness: float
@@ -193,25 +193,50 @@ def measure(
 ) -> Accuracy:
     """Compare a cloud with its scene.
 
+    Where several periods make a profile, profiles are counted in place of periods.
+
     - ``error_mm``: Result of `range_error_mm` when it is already known, shape (n,).
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
     lit: list[NDArray[np.bool_]] = []
     number = np.full(len(points), -1, dtype=np.int64)
-    for mine, positions, within in _passes(points, sweep, stage_direction):
+    every = _periods_per_profile(points, sweep.frequency_hz)
+    for mine, positions, within in _passes(points, sweep, stage_direction, every):
         before = sum(len(mask) for mask in lit)
         number[mine] = np.where(within >= 0, within + before, -1)
         lit.append(lit_columns(scene, model, positions))
     return _accuracy(points, error_mm, np.concatenate(lit), number)
 
 
+def _periods_per_profile(points: NDArray[np.void], frequency_hz: float) -> int:
+    """Return the number of modulation periods from most profiles to the next.
+
+    The columns of a profile are in order, so that the next begins where they fall. It is 1 where
+    the points are not in the order of time.
+    """
+    if len(points) == 0:
+        return 1
+    begin = np.flatnonzero(np.diff(points["column"].astype(np.int64), prepend=1 << 16) < 0)
+    number = np.diff(begin, append=len(points))
+    t_s = np.add.reduceat(points["t"], begin) / number
+    apart = np.rint(np.diff(t_s) * frequency_hz).astype(np.int64)
+    return int(np.bincount(apart).argmax()) if apart.size and apart.min() > 0 else 1
+
+
 def _passes(
-    points: NDArray[np.void], sweep: Sweep, stage_direction: tuple[float, float, float]
+    points: NDArray[np.void],
+    sweep: Sweep,
+    stage_direction: tuple[float, float, float],
+    every: int = 1,
 ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int64]]]:
-    """Yield which points are of each pass, and its periods as `complete_periods`."""
-    turned = replace(sweep, start_mm=sweep.stop_mm, stop_mm=sweep.start_mm)
+    """Yield which points are of each pass, and its periods as `complete_periods`.
+
+    ``every`` is the number of modulation periods that count as one.
+    """
     of_pass = pass_index(points, sweep, stage_direction)
+    sweep = replace(sweep, frequency_hz=sweep.frequency_hz / every)
+    turned = replace(sweep, start_mm=sweep.stop_mm, stop_mm=sweep.start_mm)
     for index in range(sweep.passes):
         mine = of_pass == index
         one = turned if index % 2 else sweep

@@ -157,6 +157,14 @@ def test_periods_without_any_point_count_as_missing():
     assert result.completeness == pytest.approx(17 / 20)
 
 
+def test_profiles_of_several_periods_count_as_one():
+    points = cloud(0.0)
+    line = np.rint(points["t"] / PERIOD_S)
+    result = accuracy.measure(points[line % 4 == 2], Wedge(), MODEL, SWEEP)
+    # The end of the sweep cuts the fifth.
+    assert (result.periods, result.completeness) == (4, 1.0)
+
+
 def test_a_sweep_has_a_speed():
     with pytest.raises(ArgumentError, match="speed_mm_s"):
         accuracy.Sweep(0.0, 1.0, 0.0, 70.0)
