@@ -205,6 +205,7 @@ class Physics:
             self._in_transit.clear()
             self._packet = self._rest = b""
             self._packet_end_us = 0
+            self._at_once_us = _FIRST_US
             self._running.set()
 
     def stop(self) -> None:
