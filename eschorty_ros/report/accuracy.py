@@ -18,7 +18,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.storage import TRUTH_DTYPE, Recording
-from eschorty_ros.surfaces.profiles import profile_index
+from eschorty_ros.surfaces.profiles import profile_begins, profile_index
 
 # Range per stage travel between two periods of one surface.
 _SLOPE_MAX = 2.0
@@ -212,12 +212,12 @@ def measure(
 def _periods_per_profile(points: NDArray[np.void], frequency_hz: float) -> int:
     """Return the number of modulation periods from most profiles to the next.
 
-    The columns of a profile are in order, so that the next begins where they fall. It is 1 where
-    the points are not in the order of time.
+    It counts whole profiles, as a column may miss in most of them. It is 1 where the points are
+    not in the order of time.
     """
     if len(points) == 0:
         return 1
-    begin = np.flatnonzero(np.diff(points["column"].astype(np.int64), prepend=1 << 16) < 0)
+    begin = profile_begins(points["column"])
     number = np.diff(begin, append=len(points))
     t_s = np.add.reduceat(points["t"], begin) / number
     apart = np.rint(np.diff(t_s) * frequency_hz).astype(np.int64)

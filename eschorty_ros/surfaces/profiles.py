@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +45,16 @@ def period_s(points: NDArray[np.void]) -> float:
         if span > elapsed[-1]:
             return period
         span *= 2.0
+
+
+def profile_begins(columns: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    """Return where the profiles of points in the order of time begin.
+
+    The columns of a profile are in order, so that the next begins where they fall.
+
+    - ``columns``: Column of each point, shape (n,).
+    """
+    return np.flatnonzero(np.diff(columns.astype(np.int64), prepend=1 << 32) < 0)
 
 
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import integer
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.surfaces.profiles import profile_begins
 
 COLOURS = ("range", "sigma", "reflectance", "pass")
 POINTS_MAX = 120_000
@@ -85,8 +86,7 @@ class GrowingCloud:
         """Return each point's pass: the stage goes the other way in the next one."""
         if not {"t", "column"} <= set(names) or not len(points):
             return np.full(len(points), np.nan, np.float32)
-        column = points["column"].astype(np.int32)
-        begins = np.flatnonzero(np.diff(column, prepend=np.iinfo(np.int32).max) < 0)
+        begins = profile_begins(points["column"])
         profile = np.repeat(np.arange(len(begins)), np.diff([*begins, len(points)]))
         t, y = (
             points[name].astype(np.float64) - points[name][begins][profile] for name in ("t", "y")

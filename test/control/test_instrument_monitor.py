@@ -64,6 +64,22 @@ def test_a_drain_ends_although_there_is_progress():
     assert time.monotonic() - begun_s < 5.0
 
 
+def test_a_slow_drain_goes_on_while_the_rest_takes_no_longer_than_the_limit():
+    subject = monitor()
+    waiting = PacedWaiting("scanner", subject, lambda: 10**18, lambda: True, 3.0)
+    begun_s = time.monotonic()
+
+    def advance(phase):
+        done = (time.monotonic() - begun_s) / 1.3
+        until_ns = 10**18 - round(1e9 * max(1.0 - done, 0.0))
+        subject.update_reconstruction(ReconstructionStatus(until_ns, 0.0, 0, 0, ""), 0.0)
+
+    advance("")
+    waiting.prepare(lambda: False, advance)
+    waiting.drain(10.0, 1.0)
+    assert subject.until_ns == 10**18
+
+
 def test_the_progress_is_where_the_stage_was_at_the_newest_event():
     subject = monitor()
     # Between two scans, however long, none are kept.

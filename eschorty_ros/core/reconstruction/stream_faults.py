@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-# Chance gives half of the points of a few profiles a shift: 0.18 of a short stream at most.
+# Chance gives half of the points of a few profiles a shift, up to 0.18 of those of short streams.
 _BURST_SHIFT_SHARE = 0.22
 _RATE_CONTROL_SHARE = 0.01
 # Words that a stream which begins anywhere, or goes on after a gap, may break.

@@ -401,8 +401,8 @@ def test_a_stream_without_points_has_a_reason(case):
 
 
 @pytest.mark.parametrize(("periods", "warned"), [(2, False), (4, True)])
-def test_a_laser_that_is_switched_on_and_off_has_no_warning(periods, warned):
-    """The events of as many periods come at any time; a short scan has few others."""
+def test_events_that_follow_no_laser_have_a_warning_in_more_than_two_periods(periods, warned):
+    """A laser that is switched on and off leaves two without a phase, of few in a short scan."""
     camera = Camera(periods=16)
     t, x, y, p = camera.line(wavy)
     any_us = FIRST_EDGE_US + camera.rng.uniform(0.0, periods * camera.period_us, t.size)
