@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -40,7 +41,7 @@ class LaserInterlock:
     Public attributes:
     - ``gap_max_s``: Longest time between two heartbeats of each topic while on; a timeout below it
       would trip.
-    - ``strangers``: Heartbeats while on of other senders than those that had the laser enabled.
+    - ``foreign_heartbeats``: Heartbeats of other senders than those that had the laser enabled.
     """
 
     def __init__(
@@ -59,6 +60,8 @@ class LaserInterlock:
         self._contact_timeout_s = contact_timeout_s
         self._contact_required = contact_required
         self._now_s = now_s
+        # An opening that comes while the latch is reset must stay latched.
+        self._contact_lock = threading.Lock()
         # Time of the last report of closed by source, ``None`` after one of open.
         self._closed_s: dict[str, float | None] = {}
         self._nameless: set[str] = set()
@@ -68,7 +71,7 @@ class LaserInterlock:
         self._heartbeats: dict[str, dict[_Identity, _Heartbeat]] = {t: {} for t in timeouts_s}
         self._owners: dict[str, _Identity] = {}
         self.gap_max_s: dict[str, float] = {}
-        self.strangers = 0
+        self.foreign_heartbeats = 0
 
     @property
     def contact_open(self) -> bool:
@@ -97,15 +100,16 @@ class LaserInterlock:
 
         ``unnamed`` is the source of its reports before its name was known.
         """
-        if unnamed and unnamed != source:
-            self._closed_s.pop(unnamed, None)
-            self._nameless.discard(unnamed)
-        elif unnamed and len(self._nameless) < _KEPT:
-            self._nameless.add(unnamed)
-        if is_open:
-            self._opened_by = source or "laser/interlock"
-        if is_open or source in self._closed_s or len(self._closed_s) < _KEPT:
-            self._closed_s[source] = None if is_open else self._now_s()
+        with self._contact_lock:
+            if unnamed and unnamed != source:
+                self._closed_s.pop(unnamed, None)
+                self._nameless.discard(unnamed)
+            elif unnamed and len(self._nameless) < _KEPT:
+                self._nameless.add(unnamed)
+            if is_open:
+                self._opened_by = source or "laser/interlock"
+            if is_open or source in self._closed_s or len(self._closed_s) < _KEPT:
+                self._closed_s[source] = None if is_open else self._now_s()
 
     def reset_contact(self, living: Collection[str] | None = None) -> str:
         """Undo the latch of an opened contact; return why that is refused, ``""`` when it is not.
@@ -114,14 +118,15 @@ class LaserInterlock:
         name never became known, and that is not among the ``living`` any more, cannot report
         closed: it is dropped.
         """
-        if living is not None:
-            for source in self._nameless.difference(living):
-                self._closed_s.pop(source, None)
-                self._nameless.discard(source)
-        fault = self._source_fault()
-        if not fault:
-            self._opened_by = ""
-        return fault
+        with self._contact_lock:
+            if living is not None:
+                for source in self._nameless.difference(living):
+                    self._closed_s.pop(source, None)
+                    self._nameless.discard(source)
+            fault = self._source_fault()
+            if not fault:
+                self._opened_by = ""
+            return fault
 
     def contact_fault(self) -> str:
         """Return why the contact counts as open, ``""`` while it is closed."""
@@ -139,7 +144,7 @@ class LaserInterlock:
         known = heartbeats.get(identity)
         owner = self._owners.get(topic, identity)
         if owner != identity:
-            self.strangers += 1
+            self.foreign_heartbeats += 1
         if stopped:
             if known is not None:
                 known.stopped = True

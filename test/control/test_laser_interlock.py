@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -181,6 +182,29 @@ def test_reported_stop_trips_unless_it_is_of_another_sender(interlock):
     assert interlock.trip_reason() is None
 
 
+def test_an_opening_while_the_latch_is_reset_stays_latched():
+    reports: list[threading.Thread] = []
+
+    def now_s():
+        """Return a constant; while the reset looks at the ages, another thread reports."""
+        if reports and reports[0].ident is None:
+            reports[0].start()
+            reports[0].join(0.2)
+        return 100.0
+
+    interlock = LaserInterlock(10.0, 600.0, {}, now_s=now_s)
+
+    def opens_and_closes():
+        interlock.receive_contact(True, "door")
+        interlock.receive_contact(False, "door")
+
+    opens_and_closes()
+    reports.append(threading.Thread(target=opens_and_closes))
+    assert interlock.reset_contact() == ""
+    reports[0].join(5.0)
+    assert interlock.contact_fault() == "interlock was opened (door); call laser/reset_interlock"
+
+
 def test_only_the_sender_that_had_it_enabled_keeps_the_light(interlock, clock):
     light(interlock, heartbeat_text(stopped=False))
     clock.now_s += 1.1
@@ -190,7 +214,7 @@ def test_only_the_sender_that_had_it_enabled_keeps_the_light(interlock, clock):
         interlock.receive_heartbeat(CLIENT_HEARTBEAT, heartbeat_text(stopped=False), f"{number}")
         interlock.receive_heartbeat(CAMERA, "", f"{number}")
     assert "laser/heartbeat older than 1 s" in str(interlock.trip_reason())
-    assert interlock.strangers == 300
+    assert interlock.foreign_heartbeats == 300
     interlock.receive_heartbeat(CLIENT_HEARTBEAT, heartbeat_text(stopped=False))
     assert interlock.trip_reason() is None
     interlock.note_disabled()

@@ -306,7 +306,7 @@ class LaserNode(DeviceNode):
             "armed": interlock.armed,
             "interlock_open": interlock.contact_open,
             "interlock": interlock.contact_fault() or "closed",
-            "heartbeats of strangers while on": interlock.strangers,
+            "foreign_heartbeats": interlock.foreign_heartbeats,
             "reason": status.reason if status else "",
             "switch_offs": supervisor.switch_offs,
         }
