@@ -12,7 +12,7 @@ import click
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, sweep_options
+from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, stated, sweep_options
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
@@ -112,10 +112,15 @@ def command(
     if not live:
         refuse_given(("host", "port"), "belongs to --live")
     one_scan = nodes_module("one_process.scan", make="scan")
-    _check(scene, calibration, effects)
     tables = None
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
+        given, of_file = stated(("calibration", "keep")), tables.get("reconstruction", {})
+        calibration = (
+            calibration if "calibration" in given else of_file.get("calibration", calibration)
+        )
+        keep = keep if "keep" in given else of_file.get("keep", keep)
+    _check(scene, calibration, effects)
     job = one_scan.ScanJob(
         scene=scene,
         calibration=calibration,

@@ -18,6 +18,7 @@ from eschorty_ros.simulation.scenes import named
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.cli.scan import finish
+from eschorty_ros.nodes.one_process import scan
 from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
 
@@ -129,6 +130,26 @@ def test_an_unknown_name_is_one_line_before_any_node_starts(tmp_path, option, va
     (line,) = done.output.splitlines()
     assert value in line
     assert not out.exists()
+
+
+def test_options_on_the_command_line_win_over_the_hardware_file(tmp_path, monkeypatch):
+    seen = {}
+
+    def started(tables, *_):
+        seen.update(tables["reconstruction"])
+        raise DeviceError("seen")
+
+    monkeypatch.setattr(scan, "composition", started)
+    lab = tmp_path / "lab.yaml"
+    lab.write_text(
+        "/eschorty/reconstruction:\n"
+        "  ros__parameters: {calibration: nominal, keep: good, events_min: 7}\n"
+    )
+    arguments = ["scan", "--hardware", str(lab), "--out", str(tmp_path / "scan")]
+    for given, expected in (([], "nominal"), (["--calibration", "config_3"], "config_3")):
+        done = CliRunner().invoke(main, [*arguments, *given])
+        assert "seen" in done.output
+        assert seen == {"calibration": expected, "keep": "good", "events_min": 7}
 
 
 def test_a_scan_without_points_is_no_success(tmp_path):

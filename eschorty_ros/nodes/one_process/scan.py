@@ -92,7 +92,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
     """
     tables = bench_parameters() if job.hardware is None else {**job.hardware}
     own = {"calibration": job.calibration, "keep": job.keep}
-    tables["reconstruction"] = {**own, **tables.get("reconstruction", {})}
+    tables["reconstruction"] = {**tables.get("reconstruction", {}), **own}
     if job.record is not None:
         parent, name = str(job.record.resolve().parent), job.record.resolve().name
         tables["reconstruction"] |= {"record": parent, "record_name": name}
