@@ -73,6 +73,7 @@ class PacketStream:
         packet_period_s: float = 0.0,
     ) -> None:
         self.calibration = calibration
+        self._model = calibration.model()
         self.packets = 0
         self.packets_lost = 0
         self.packets_late = 0
@@ -233,8 +234,9 @@ class PacketStream:
 
     def set_calibration(self, calibration: Calibration) -> None:
         """Use ``calibration`` for packets processed later; the open period is closed first."""
-        self.calibration = calibration
         self._renew()
+        self.calibration = calibration
+        self._model = calibration.model()
 
     def add(self, packet: Packet, now_s: float) -> None:
         """Queue one packet that arrived at ``now_s`` of the steady clock."""
@@ -416,7 +418,9 @@ class PacketStream:
     def _collect(self, profiles: Profiles) -> None:
         if len(profiles):
             assert self._epoch is not None
-            self._out.append(TimedProfiles.within(self._epoch, profiles, self._wraps * WRAP_US))
+            build = self._model, self.calibration.stage_direction
+            shift_us = self._wraps * WRAP_US
+            self._out.append(TimedProfiles.within(self._epoch, profiles, shift_us, *build))
 
     def _completed(self) -> list[TimedProfiles]:
         out, self._out = self._out, []

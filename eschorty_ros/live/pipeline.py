@@ -114,7 +114,7 @@ class Pipeline:
       ``PacketStream`` and ``StagePlacer``.
 
     Public attributes:
-    - ``calibration``, ``model``: Those of packets processed from now on.
+    - ``calibration``: That of packets processed from now on.
     - ``stream``, ``placer``: The packet stream and the stage placement.
     - ``profiles``, ``points``: Numbers of profiles completed and of points placed.
     - ``capture``: Receives a calibration's events and placed profiles while it is set.
@@ -130,7 +130,6 @@ class Pipeline:
         packet_period_s: float = 0.0,
     ) -> None:
         self.calibration = calibration
-        self.model = calibration.model()
         self.stream = PacketStream(calibration, settings, clock_timeout_s, packet_period_s)
         self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
         self.profiles = 0
@@ -201,7 +200,6 @@ class Pipeline:
             )
         self.stream.set_calibration(calibration)
         self.calibration = calibration
-        self.model = calibration.model()
 
     def begin_scan(
         self,
@@ -302,7 +300,7 @@ class Pipeline:
             self.placer.add_profiles(part, now_s)
 
     def _placed(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
-        points = place(timed.profiles, self.model, stage_mm, self.calibration.stage_direction)
+        points = place(timed.profiles, timed.model, stage_mm, timed.stage_direction)
         return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm, timed.sensor)
 
     def _placed_again(self, part: PlacedPoints) -> PlacedPoints:

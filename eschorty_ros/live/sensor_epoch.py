@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.clocks import EdgeClock, PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
 
 _PULSES_MISSING = 30
@@ -92,27 +93,42 @@ class SensorTimes:
 class TimedProfiles:
     """Profiles with int64 ROS nanoseconds of each point and of its period's rising edge.
 
-    ``sensor`` holds the sensor times while the clock may still improve.
+    ``model`` and ``stage_direction`` are those of their calibration. ``sensor`` holds the sensor
+    times while the clock may still improve.
     """
 
     profiles: Profiles
     t_ns: NDArray[np.int64]
     edge_ns: NDArray[np.int64]
+    model: RangeModel
+    stage_direction: tuple[float, ...]
     sensor: SensorTimes | None = None
 
     @classmethod
-    def within(cls, epoch: SensorEpoch, profiles: Profiles, shift_us: int) -> TimedProfiles:
+    def within(
+        cls,
+        epoch: SensorEpoch,
+        profiles: Profiles,
+        shift_us: int,
+        model: RangeModel,
+        stage_direction: tuple[float, ...],
+    ) -> TimedProfiles:
         """Return timed profiles; ``shift_us`` is added to their times for the epoch's."""
         sensor = SensorTimes(epoch, profiles.t_us + shift_us, profiles.edge_us + shift_us)
-        return cls(profiles, *sensor.to_ns(), None if epoch.clock.exact else sensor)
+        later = None if epoch.clock.exact else sensor
+        return cls(profiles, *sensor.to_ns(), model, stage_direction, later)
 
     def select(self, mask: NDArray[np.bool_] | slice) -> TimedProfiles:
         """Return the points where ``mask`` is set, or of a slice."""
         if not isinstance(mask, slice) and mask.all():
             return self
         sensor = None if self.sensor is None else self.sensor.select(mask)
-        return TimedProfiles(
-            self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask], sensor
+        return replace(
+            self,
+            profiles=self.profiles.select(mask),
+            t_ns=self.t_ns[mask],
+            edge_ns=self.edge_ns[mask],
+            sensor=sensor,
         )
 
     def retimed(self) -> TimedProfiles:

@@ -1,5 +1,7 @@
 """Packets with losses, late joins, restarts and clocks of every kind, against one plain run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from line_events import encoded, line_events
@@ -491,3 +493,25 @@ def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
         pipeline.add_packet(packet, 0.0)
     pipeline.process(0.0)
     assert "as wide as line_width_px = 6" in ended(pipeline).message
+
+
+def test_profiles_that_wait_for_the_stage_keep_their_calibration():
+    data, turned = line(), replace(CALIBRATION, stage_direction=(0.0, -1.0, 0.0))
+    placed = {}
+    for exchanged in (False, True):
+        pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 6.0)
+        pipeline.stream.announce_zero(ZERO_NS)
+        pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+        for packet in packets(data):
+            pipeline.add_packet(packet, 0.0)
+        pipeline.process(0.0)
+        if exchanged:
+            pipeline.set_calibration(turned)
+        for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
+            pipeline.add_stage(at_ns, 0.5)
+        placed[exchanged] = np.concatenate([part.points for part in pipeline.place(0.0)])
+    before = placed[False]
+    assert len(before) > 5000
+    # The exchange closes the open period, too.
+    np.testing.assert_array_equal(placed[True][: len(before)], before)
+    assert np.all(placed[True]["y"] > 0.0)

@@ -5,6 +5,7 @@ import pytest
 from line_events import blank_profiles
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.live.pipeline import ScanReport
 from eschorty_ros.live.scan_buffer import PlacedPoints, ScanBuffer
@@ -12,6 +13,7 @@ from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.live.stage_placement import StagePlacer
 
 T0_NS = 1_700_000_000_000_000_123
+CALIBRATION = load_calibration("config_3")
 
 
 def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
@@ -23,7 +25,8 @@ def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
 
 def timed(t_ns):
     t_ns = np.asarray(t_ns, dtype=np.int64)
-    return TimedProfiles(blank_profiles(len(t_ns)), t_ns, t_ns)
+    build = CALIBRATION.model(), CALIBRATION.stage_direction
+    return TimedProfiles(blank_profiles(len(t_ns)), t_ns, t_ns, *build)
 
 
 def following(samples_ms):

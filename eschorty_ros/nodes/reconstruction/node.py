@@ -244,7 +244,6 @@ class ReconstructionNode(Node):
     def _use_calibration(self, calibration: Calibration) -> None:
         def use() -> None:
             self._pipeline.set_calibration(calibration)
-            self._outputs.set_calibration(calibration)
             self.calibration = calibration
             self._camera_roi.follow(self.parameters.settings(Settings), calibration.model())
 
@@ -303,8 +302,9 @@ class ReconstructionNode(Node):
     def _add_packet(self, packet: Packet) -> None:
         stream = self._pipeline.stream
         if stream.epoch is None:
-            clock = self._announcement.subscription
-            stream.announcement_expected = clock.get_publisher_count() > 0
+            # Asked by name: the subscription may be replaced meanwhile.
+            topic = self._announcement.subscription.topic_name
+            stream.announcement_expected = self.count_publishers(topic) > 0
         try:
             self._pipeline.add_packet(packet, time.monotonic())
         except FormatError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -36,7 +35,7 @@ class Outputs:
     """
 
     def __init__(self, node: Node, calibration: Calibration, profile_rate_max_hz: float) -> None:
-        self._model = calibration.model()
+        self._node, self._columns, self._rows = node, calibration.columns, calibration.rows
         self._profile_spacing_ns = round(1e9 / profile_rate_max_hz)
         override = {"qos_overriding_options": qos.overridable()}
         self._profile = node.create_publisher(PointCloud2, "profile", qos.stream(10), **override)
@@ -59,17 +58,13 @@ class Outputs:
         """Return whether points that come now need not wait."""
         return time.monotonic() - self._points_at_s >= POINTS_INTERVAL_S
 
-    def set_calibration(self, calibration: Calibration) -> None:
-        """Use another calibration of the same sensor."""
-        self._model = calibration.model()
-
     def packet(self, data: Any) -> None:
         """Add a packet to the event image if it has a subscriber."""
         if self._image.get_subscription_count() == 0:
             self._frame = None
             return
         if self._frame is None:
-            self._frame = EventFrame(self._model.columns, self._model.rows)
+            self._frame = EventFrame(self._columns, self._rows)
         self._frame.push(data)
 
     def event_frame(self, stamp_ns: int) -> None:
@@ -86,7 +81,7 @@ class Outputs:
         for timed in fresh:
             for profile in self._spaced(timed):
                 stamp_ns = int(profile.t_ns.min())
-                points = place_link(profile.profiles, self._model)
+                points = place_link(profile.profiles, profile.model)
                 live = live_points(points, profile.t_ns, stamp_ns)
                 self._profile.publish(serialized_cloud([live], stamp_ns, LINK))
 
@@ -133,7 +128,9 @@ class Outputs:
         stamp_ns = scan.stamp_ns if len(scan.points) else fallback_stamp_ns
         points = scan.points
         if organized:
-            # A scan during which returns was changed may have no map.
-            with contextlib.suppress(ArgumentError):
-                points = height_map(points, scan.edge_ns, self._model.columns)
+            try:
+                points = height_map(points, scan.edge_ns, self._columns)
+            except ArgumentError as error:
+                # The parameter returns was changed during the scan.
+                self._node.get_logger().warning(f"scan/points is not organized: {error}")
         self._scan.publish(cloud_message(points, stamp_ns, BASE))

@@ -53,7 +53,8 @@ def timed(edges_us):
         flags=np.zeros(count, np.uint16), range_mm=1000.0 + np.arange(count),
         sigma_mm=np.ones(count),
     )  # fmt: skip
-    return TimedProfiles(profiles, ZERO_NS + t_us * 1000, ZERO_NS + edge_us * 1000)
+    times = ZERO_NS + t_us * 1000, ZERO_NS + edge_us * 1000
+    return TimedProfiles(profiles, *times, CALIBRATION.model(), CALIBRATION.stage_direction)
 
 
 def times_ns(message):
