@@ -66,7 +66,10 @@ def _pieces(
     begin = 0
     for chunk in reader.chunks(_PIECE_BYTES):
         inside = (marks["byte"] >= begin) & (marks["byte"] < begin + len(chunk))
-        cuts = {byte - begin: (lost, bool(on)) for byte, lost, on in marks[inside].tolist()}
+        cuts: dict[int, tuple[int, bool]] = {}
+        for byte, lost, on in marks[inside].tolist():
+            before, was_on = cuts.get(byte - begin, (0, False))
+            cuts[byte - begin] = before + lost, was_on or bool(on)
         starts = sorted({0, *cuts})
         for start, stop in zip(starts, [*starts[1:], len(chunk)], strict=True):
             yield chunk[start:stop], cuts.get(start)

@@ -166,6 +166,8 @@ class ScanRecorder:
     def _work(self) -> None:
         with self._noted():
             make_recording_folder(self.folder)
+        if self._failure:
+            self._ended.set()
         self._made.set()
         while not self._ended.is_set():
             with self._arrived:
@@ -186,6 +188,9 @@ class ScanRecorder:
             yield
         except EschortyError as error:
             self._failure = self._failure or str(error)
+        except Exception as error:
+            # Whoever waits for the disk would wait for ever.
+            self._failure = self._failure or repr(error)
 
     def _begin(self) -> None:
         assert self._modulation is not None

@@ -12,8 +12,12 @@ import recorded_scan
 from recorded_scan import LiveScan
 
 from eschorty_ros.core.reconstruction import reconstruct_recording
-from eschorty_ros.core.storage import load_recording, read_cloud
+from eschorty_ros.core.storage import ScanLog, load_recording, read_cloud
+from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import MARK_DTYPE
 from eschorty_ros.core.storage.recording_writer import RecordingWriter
+from eschorty_ros.live.recorded_packets import timed_packets
+from eschorty_ros.live.scan_recorder import ScanRecorder
 
 FIELDS = ("x", "z", "intensity", "sigma", "column")
 
@@ -103,3 +107,31 @@ def test_a_full_disk_ends_the_recording_and_not_the_scan(tmp_path, source):
     known = result.points[: -source.calibration.columns]
     assert len(known) > 50
     np.testing.assert_array_equal(known["x"], whole["x"][: len(known)])
+
+
+def test_a_folder_that_cannot_be_made_leaves_no_thread(tmp_path, source):
+    (tmp_path / "file").write_text("")
+    log = ScanLog(scan_id="s", start_mm=0.0, stop_mm=1.0)
+    recorder = ScanRecorder(tmp_path / "file" / "rec", log, source.calibration, {})
+    fault = recorder.made(5.0)
+    assert "cannot" in fault
+    assert recorder.wait(0.0) == f"recording {tmp_path / 'file' / 'rec'}: {fault}"
+
+
+def test_an_unexpected_error_ends_the_recording_and_not_the_scan(tmp_path, source, monkeypatch):
+    def fails(self, data):
+        raise MemoryError("no memory")
+
+    monkeypatch.setattr(RecordingWriter, "events", fails)
+    scan = LiveScan(source, tmp_path / "rec")
+    report = scan.run()
+    assert len(report.scan.points) > 500
+    assert "no memory" in scan.recorder.wait(10.0)
+
+
+def test_two_marks_of_one_place_count_both(source):
+    marks = np.zeros(2, MARK_DTYPE)
+    marks["byte"], marks["packets_lost"], marks["laser_on"] = 3000, [2, 1], [1, 0]
+    packets = list(timed_packets(RawReader(source.events_path), marks))
+    assert sum(packet.packets_lost for packet in packets) == 3
+    assert sum(packet.laser_on for packet in packets) == 1

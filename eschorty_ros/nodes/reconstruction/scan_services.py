@@ -129,9 +129,9 @@ class ScanServices:
         recorder = self._recorder
         if not repeated:
             recorder = self._make_recorder(request.scan_id, *limits_mm, passes)
-        if recorder is not None and (fault := recorder.made(_RECORD_S)):
-            response.success, response.message = False, fault
-            return response
+            if recorder is not None and (fault := recorder.made(_RECORD_S)):
+                response.success, response.message = False, fault
+                return response
         begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder, passes)
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         if response.success:
