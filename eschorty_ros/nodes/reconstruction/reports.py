@@ -40,6 +40,7 @@ class Reports:
         self._state = node.create_publisher(ReconstructionState, "reconstruction/state", 10)
         self._rate = diagnostics.Rate()
         self._diagnostics_rate = diagnostics.Rate()
+        self._lost_reported = 0, 0
 
     def publish_state(self) -> None:
         """Publish ``reconstruction/state``."""
@@ -93,9 +94,7 @@ class Reports:
             return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
         if stream.epoch is not None and stream.epoch.edges_missing:
             return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
-        if stream.packets_lost or placer.points_without_stage:
-            return diagnostics.WARN, "packets or points were lost", values
-        if warnings := stream.warnings:
+        if warnings := [*self._new_losses(), *stream.warnings]:
             return diagnostics.WARN, "; ".join(warnings), values
         if not stream.packets:
             late = time.monotonic() > self._begun_s + PACKETS_EXPECTED_S
@@ -106,3 +105,15 @@ class Reports:
                 )
             return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values
         return diagnostics.OK, "reconstructing", values
+
+    def _new_losses(self) -> list[str]:
+        """Return a line for each loss since the last call."""
+        lost = self._pipeline.stream.packets_lost, self._pipeline.placer.points_without_stage
+        before, self._lost_reported = self._lost_reported, lost
+        return [
+            f"{now - then:,} {what} since the last report, {now:,} so far"
+            for now, then, what in zip(
+                lost, before, ("packets lost", "points without stage position"), strict=True
+            )
+            if now > then
+        ]

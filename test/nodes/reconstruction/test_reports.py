@@ -37,6 +37,23 @@ def test_a_warning_of_the_reconstruction_is_the_line_of_the_diagnostics(lost):
         assert (level, line) == (diagnostics.OK, "reconstructing")
 
 
+def test_a_loss_is_reported_once_beside_other_warnings():
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    pipeline.stream.announce_zero(0)
+    pipeline.stream.set_laser(Modulation(70.0), 1_000_000)
+    rng = np.random.default_rng(3)
+    data = encoded(line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=1000))
+    for seq, half in ((0, data[: len(data) // 2 & ~1]), (3, data[len(data) // 2 & ~1 :])):
+        pipeline.stream.add(Packet(seq, 0, half), 0.0)
+    pipeline.complete(0.0)
+    node = SimpleNamespace(create_publisher=lambda *_: None)
+    reports = Reports(node, pipeline, JobQueue(1))
+    level, line, _ = reports.diagnose()
+    assert level == diagnostics.WARN, "seed 3"
+    assert "2 packets lost since the last report, 2 so far" in line
+    assert "packets lost" not in reports.diagnose()[1]
+
+
 def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
     logged = []
