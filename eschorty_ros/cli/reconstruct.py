@@ -283,6 +283,7 @@ def _print(
     if as_json or not facts["points"]:
         return
     sigma, lag_ms = facts["sigma_median_m"], facts.get("pass_lag_ms")
+    outside = facts["counters"].get("points_outside_scan")
     lag = None if lag_ms is None else PassLag(*(1e3 * ms for ms in lag_ms))
     pairs(
         str(target),
@@ -292,6 +293,7 @@ def _print(
             "profiles": f"{facts['profiles']:,}",
             "periods per profile": f"{facts['periods_per_profile']}",
             "points": f"{facts['points']:,}",
+            **({"points outside the scan": f"{outside:,}"} if outside else {}),
             "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
             **({} if lag is None else {"lag taken off": str(lag)}),
             "seconds": f"{facts['seconds']:.2f}",

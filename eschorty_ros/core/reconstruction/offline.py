@@ -49,7 +49,7 @@ class Result:
     """The same points before placing, with their rows and times; none where the points are in a
     file and the recording has no truth to compare them with."""
     counters: dict[str, int]
-    """The reconstructor's, and ``points_without_stage``."""
+    """The reconstructor's, and ``points_without_stage`` and ``points_outside_scan``."""
     profile_count: int
     periods_per_profile: int
     events: int
@@ -118,6 +118,7 @@ def reconstruct_recording(
     span_us = None if newest_us is None else (origin_us, newest_us)
     counters = reconstructor.counters
     counters["points_without_stage"] = cloud.without_stage
+    counters["points_outside_scan"] = cloud.outside_scan
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
     shown_hz = shown_frequency_hz(recording) if shown is None else shown.result()
     warnings = (
@@ -159,7 +160,7 @@ class _Cloud:
             self._organized = _Array(folder and folder / "organized", files)
         self._newest_edge_us: int | None = None
         self.profile_count = 0
-        self.without_stage = 0
+        self.without_stage = self.outside_scan = 0
 
     def add(self, profiles: Profiles) -> None:
         """Append complete profiles."""
@@ -168,7 +169,9 @@ class _Cloud:
         known = np.isfinite(position)
         self.without_stage += int(known.size - known.sum())
         if recording.scan is not None:
-            known &= between(position, recording.scan.start_mm, recording.scan.stop_mm)
+            inside = between(position, recording.scan.start_mm, recording.scan.stop_mm)
+            self.outside_scan += int((known & ~inside).sum())
+            known &= inside
         if not known.all():
             profiles, position = profiles.select(known), position[known]
         if not len(profiles):

@@ -39,6 +39,8 @@ _LOSSES = {
     "{0.isolation_gate_px:g}; raise it, or lower isolation_events = {0.isolation_events}",
     "columns_ambiguous": "columns have two equally strong lines; set returns to all",
     "points_beyond_pole": "points are beyond the last range of the calibration; check it",
+    "points_outside_scan": "points are outside start to stop of the recorded scan; check the "
+    "stage's positions",
 }
 """Losses after which no point is left, with what to do; ``{0}`` are the settings."""
 _FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to none"
@@ -74,7 +76,7 @@ def recording_warnings(
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
 
-    - ``counters``: The reconstructor's, and ``points_without_stage``.
+    - ``counters``: See `Result`.
     - ``points``: The cloud, of POINT_DTYPE.
     - ``span_us``: Sensor times of the first and the last event, ``None`` without events.
     - ``shown_hz``: See `shown_frequency_hz`.

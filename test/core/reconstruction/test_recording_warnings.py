@@ -8,6 +8,7 @@ from eschorty_ros.core.base.errors import CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -57,6 +58,11 @@ def with_broken_words(recording):
     return replace(recording, events_path=broken)
 
 
+def with_scan_elsewhere(recording):
+    scan = ScanLog(scan_id="s", state="ended", start_mm=500.0, stop_mm=600.0)
+    return replace(recording, scan=scan)
+
+
 @pytest.mark.parametrize("scene", ["plane", "posts"])
 def test_a_good_recording_has_no_warning(recording, tmp_path, scene):
     if scene == "posts":
@@ -104,6 +110,7 @@ def test_stage_positions_of_a_later_turn_of_the_cameras_clock_are_those_of_the_e
         # In another turn of the camera's clock, and in the host's time.
         (lambda r: with_stage(r, (4 << 24) + 6_000_000), {}, "have no stage position; give the", 0),
         (lambda r: with_stage(r, 10**8 << 24), {}, "have no stage position; give the stage log", 0),
+        (with_scan_elsewhere, {}, "points are outside start to stop of the recorded scan", 0),
         (with_broken_words, {}, "are not as EVT3 has them", 0),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
         (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),
