@@ -199,14 +199,16 @@ class CameraNode(DeviceNode):
         source, settings = self._source, camera_settings(proposed)
         if source is None:
             return
-        if settings.windows != windows_given(self.parameters):
-            source.set_windows(settings.windows)
-        for name in BIASES:
-            offset = proposed[name]
-            if offset != self._biases.get(name):
-                self._biases[name] = source.set_bias(name, offset)
-                if self._biases[name] != offset:
-                    self._biases_changed()
+        changed = [name for name in BIASES if proposed[name] != self._biases.get(name)]
+        try:
+            for name in changed:
+                self._biases[name] = source.set_bias(name, proposed[name])
+            if settings.windows != windows_given(self.parameters):
+                source.set_windows(settings.windows)
+        finally:
+            # The camera may have others than asked for, or, after an error, some of those.
+            if changed:
+                self._biases_changed()
 
     def _write_parameters(self) -> None:
         changed = [

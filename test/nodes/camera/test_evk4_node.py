@@ -19,6 +19,7 @@ from ros_process import Observer, nodes_here, wait_until
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.evk4 import Evk4Model
 from eschorty_ros.hardware.camera import evk4
 from eschorty_ros.live.device_messages import ns_from_stamp
@@ -180,6 +181,27 @@ def test_biases_are_parameters_that_the_camera_holds(start: Start, tmp_path: Pat
     assert path.read_text().startswith("30  % bias_diff_on\n0  % bias_diff_off\n6  % bias_fo\n")
     statistics = run.observer.call(Trigger, "camera/dump_statistics")
     assert "bias_refr 40" in statistics.message
+
+
+def test_after_a_failed_write_the_parameters_are_what_the_camera_holds(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start().active()
+    written = evk4.Evk4.set_bias
+
+    def set_bias(self: evk4.Evk4, name: str, offset: int) -> int:
+        if name == "bias_fo":
+            raise DeviceError("no answer")
+        return written(self, name, offset)
+
+    monkeypatch.setattr(evk4.Evk4, "set_bias", set_bias)
+    both = [Parameter("bias_diff_on", value=20), Parameter("bias_fo", value=5)]
+    request = SetParametersAtomically.Request(parameters=[p.to_parameter_msg() for p in both])
+    answer = run.observer.call(SetParametersAtomically, "camera/set_parameters_atomically", request)
+    assert "no answer" in answer.result.reason
+    assert dict(run.model.settings.biases)["bias_diff_on"] == 20
+    wait_until(lambda: run.node.parameters["bias_diff_on"] == 20, "the bias that was written")
+    assert run.node.parameters["bias_fo"] == 0
 
 
 def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
