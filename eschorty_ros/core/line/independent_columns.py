@@ -93,9 +93,9 @@ def estimate(
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
-    method_code, returns_code = check_method(method, returns)
     if method == "learned":
-        raise ArgumentError("centroid 'learned' follows a stream; choose another for columns alone")
+        raise ArgumentError("method 'learned' follows a stream; choose another for columns alone")
+    method_code, returns_code = check_method(method, returns)
     estimator = Estimator(
         method=method_code,
         returns=returns_code,
