@@ -16,7 +16,7 @@ from eschorty_ros.hardware.base.protocols import LaserOutput
 # With Fast DDS's defaults a lost message is repeated after 3 s.
 _STALE_S = 3.5
 # A laser reports nothing during a command.
-_SILENT_S = 2.5
+_REPORT_TIMEOUT_S = 2.5
 _REST_MM_S = 0.1
 # A stage needs some seconds to begin a move, and longer on a busy computer.
 _MOTION_S = 15.0
@@ -135,14 +135,14 @@ class InstrumentMonitor:
         """Return whether the laser's state is fresh."""
         return self.laser is not None and _age_s(self._laser_s) < _STALE_S
 
-    def silent(self, component: str) -> bool:
+    def report_late(self, component: str) -> bool:
         """Return whether ``laser``, ``stage`` or ``reconstruction`` no longer reports."""
         reported_s = {
             "laser": self._laser_s,
             "stage": self._stage_s,
             "reconstruction": self._reconstruction_s,
         }
-        return _age_s(reported_s.get(component, math.inf)) > _SILENT_S
+        return _age_s(reported_s.get(component, math.inf)) > _REPORT_TIMEOUT_S
 
     def restart_progress(self) -> None:
         """Count the time without progress of the reconstruction from now."""

@@ -211,7 +211,7 @@ def test_a_zero_announced_again_is_not_forgotten_at_the_next_scan():
     assert subject.epoch is not None
 
 
-def test_camera_restart_begins_anew_with_its_new_clock():
+def test_times_after_a_camera_restart_are_of_its_new_clock():
     data = line()
     subject = announced()
     first = run(subject, packets(data))
@@ -263,7 +263,7 @@ def sent(data, shift_us=0, seq=0):
     return out
 
 
-def test_nobody_waits_for_an_announcement_that_nobody_makes():
+def test_without_a_publisher_no_announcement_is_waited_for():
     subject = unannounced()
     subject.add(packets(line())[0], 0.0)
     subject.process(0.0)
@@ -357,7 +357,7 @@ def test_points_move_with_the_clock_until_they_are_placed():
     assert -3_050_000_000 < moved_ns[0] < -2_800_000_000
 
 
-def test_a_clock_set_back_begins_anew_and_leaves_old_points_alone():
+def test_a_clock_set_back_starts_an_epoch_and_leaves_old_points_alone():
     subject = unannounced()
     items = sent(line())
     half = len(items) // 2

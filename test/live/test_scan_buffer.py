@@ -132,7 +132,7 @@ def test_points_wait_for_the_stage_and_are_never_extrapolated():
     assert (placer.points_without_stage, placer.waiting) == (2, 0)
 
 
-def test_profiles_of_the_background_after_the_end_keep_nobody_waiting():
+def test_profiles_of_the_background_after_the_end_delay_no_scan():
     placer = StagePlacer(gap_s=0.0, timeout_s=10.0)
     placer.add_profiles(timed([T0_NS + 500_000]), 0.0)
     placer.add_profiles(timed([T0_NS + 2_000_000]), 1.0)

@@ -23,7 +23,7 @@ from eschorty_ros.core.line.line_history import _moves_fast
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
-# Counts that are told apart; the last is that number or more.
+# Counts that are separated; the last is that number or more.
 _COUNTS = 12
 # Candidates to either side of the first row.
 _SIDE = 2 * _PLACES

@@ -24,7 +24,7 @@ from eschorty_ros.core.line.line_history import (
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART
 
-# Widths that are told apart, per row and in all.
+# Widths that are separated, per row and in all.
 _PER_ROW = 16
 _BINS = 1 << 10
 # A width is usual when this share of the stream's points is within one standard deviation of it: a

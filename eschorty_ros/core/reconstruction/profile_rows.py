@@ -349,7 +349,7 @@ def _close(memory):
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
     if sums.unmodulated > sums.lines:
-        # The laser or the period's edge has begun anew.
+        # The laser or the period's edge has started again.
         blink.lines[:] = 0.0
     _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
     _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)

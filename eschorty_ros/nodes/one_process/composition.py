@@ -44,7 +44,7 @@ START_S = 300.0
 """A slow machine's first start compiles for minutes."""
 _POLL_S = 0.02
 
-SILENCE_S = 300.0
+FEEDBACK_TIMEOUT_S = 300.0
 
 Tables = dict[str, dict[str, Any]]
 """Parameters by node."""
@@ -134,8 +134,8 @@ class Composition:
             # A slow machine may take any time: only a lack of feedback ends the wait.
             while not finished.done():
                 self._spinning.raise_error()
-                if time.monotonic() - newest_s > SILENCE_S:
-                    raise DeviceError(f"no feedback of the action for {SILENCE_S:.0f} s")
+                if time.monotonic() - newest_s > FEEDBACK_TIMEOUT_S:
+                    raise DeviceError(f"no feedback of the action for {FEEDBACK_TIMEOUT_S:.0f} s")
                 time.sleep(_POLL_S)
         except BaseException:
             handle.cancel_goal_async()

@@ -1,4 +1,4 @@
-"""A deadlock of Fast DDS 3: its threads wait for each other, and the node is silent for ever."""
+"""A deadlock of Fast DDS 3: its threads wait for each other, and the node sends nothing more."""
 
 from __future__ import annotations
 

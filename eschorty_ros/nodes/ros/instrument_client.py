@@ -53,7 +53,7 @@ _ASSEMBLE_S = 60.0
 # The reconstruction first works off the packets that a broken link has held back.
 _BEGIN_S = 20.0
 # For an answer of a node that no longer reports.
-_SILENT_WAIT_S = 0.3
+_LATE_NODE_WAIT_S = 0.3
 _LEAST_WAIT_S = 0.1
 _CLOCKS_S = 20.0
 
@@ -278,8 +278,8 @@ class InstrumentClient(PacedWaiting):
     def _await(self, answered: Callable[[], bool], name: str, timeout_s: float) -> None:
         """Wait for an answer; only shortly for one of a node that no longer reports."""
         component = name.split("/")[0]
-        if self.monitor.silent(component):
-            timeout_s = _SILENT_WAIT_S
+        if self.monitor.report_late(component):
+            timeout_s = _LATE_NODE_WAIT_S
         self.wait(answered, timeout_s, f"{component}: no answer of {name}")
 
     def _call(

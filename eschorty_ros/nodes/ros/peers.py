@@ -15,7 +15,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
-_SILENCE_NS = 250_000_000
+_PUBLISHER_TIMEOUT_NS = 250_000_000
 _CHECK_S = 1.0
 _NAMES_MAX = 64
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -34,7 +34,10 @@ class OnePublisher:
         Raises ``ArgumentError`` when another publisher's stream goes on.
         """
         publisher, received_ns = _publisher(info), int(info["received_timestamp"])
-        if publisher != self._publisher and abs(received_ns - self._received_ns) < _SILENCE_NS:
+        if (
+            publisher != self._publisher
+            and abs(received_ns - self._received_ns) < _PUBLISHER_TIMEOUT_NS
+        ):
             raise ArgumentError("another node publishes it, too; stop all but one")
         self._publisher, self._received_ns = publisher, received_ns
         return publisher

@@ -1,4 +1,4 @@
-"""Timers on the steady clock, which nobody sets and no replay stops."""
+"""Timers on the steady clock, which is never set and no replay stops."""
 
 from __future__ import annotations
 

@@ -38,9 +38,9 @@ TABLE = (
 )  # fmt: skip
 
 _SHOW_S = 0.4
-_LASER_SILENT_S = 2.0
+_LASER_TIMEOUT_S = 2.0
 # The scanner sends feedback ten times a second.
-_SCANNER_SILENT_S = 10.0
+_SCANNER_TIMEOUT_S = 10.0
 _COUNTS = (
     "profiles", "points", "packets_lost", "events_dropped", "sensor_drop_words",
     "points_without_stage",
@@ -140,7 +140,7 @@ class ViewerNode(Node):
         return Conditions(
             scanner=self._scan.server_is_ready(),
             scanning=bool(self._scan_id) or self._control.under_way,
-            laser=time.monotonic() - self._laser_s < _LASER_SILENT_S,
+            laser=time.monotonic() - self._laser_s < _LASER_TIMEOUT_S,
             interlock_open=self._interlock_open,
         )
 
@@ -157,7 +157,7 @@ class ViewerNode(Node):
         self._cancel_wanted |= cancel or self._control.abandoned(self.page.pages)
         if self._handle is not None and self._cancel_wanted:
             self._handle.cancel_goal_async()
-        if time.monotonic() - self._laser_s >= _LASER_SILENT_S:
+        if time.monotonic() - self._laser_s >= _LASER_TIMEOUT_S:
             self._status.laser, self._status.reason = "no report", ""
         profile, self._profile = self._profile, None
         frame, self._frame = self._frame, None
@@ -165,8 +165,8 @@ class ViewerNode(Node):
 
     def _check_scanner(self) -> None:
         """Give up a scan whose scanner is gone; another one may have come in its place."""
-        silent_s = time.monotonic() - self._scanner_s
-        if self._control.under_way and silent_s > _SCANNER_SILENT_S:
+        age_s = time.monotonic() - self._scanner_s
+        if self._control.under_way and age_s > _SCANNER_TIMEOUT_S:
             # One that has only stalled goes on with its goal.
             self._release()
             self._end("the scanner does not answer; start another scan when it is there again")

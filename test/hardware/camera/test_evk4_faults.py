@@ -104,13 +104,13 @@ def test_another_camera_is_plugged_in_instead() -> None:
     """driver: leaves the other serial alone and searches on; user reads: 'none with serial 00051234 can be opened, but there is 00000099; check cable, power and serial'."""
     with CameraBench(attempts=2) as bench:
         bench.streaming()
-        stranger = Evk4Model(OnDemand(), board=BoardIdentity(serial=0x99), wait=lambda *_: False)
-        bench.bus[:] = [stranger]
+        other = Evk4Model(OnDemand(), board=BoardIdentity(serial=0x99), wait=lambda *_: False)
+        bench.bus[:] = [other]
         bench.model.gone = True
         with pytest.raises(DeviceGoneError, match=r"none with serial 00051234.*there is 00000099"):
             read_on(bench)
-        assert stranger.watch.phase is Phase.OFF
-        assert not stranger.claims
+        assert other.watch.phase is Phase.OFF
+        assert not other.claims
 
 
 @pytest.mark.fault("USB unplugged")

@@ -136,7 +136,7 @@ def test_an_interlock_that_one_source_opened_stays_open_until_it_is_reset(
     node.destroy_node()
 
 
-def test_heartbeats_of_strangers_keep_no_light(doomed: SafetyBench) -> None:
+def test_foreign_heartbeats_keep_no_light(doomed: SafetyBench) -> None:
     """Nor does any text of them end the node."""
     observer, texts = doomed.observer, ("", f"{place()} {os.getpid()}", f"host {'9' * 5000}")
     for publisher in [

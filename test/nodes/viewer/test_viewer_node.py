@@ -35,7 +35,7 @@ class Instrument(Node):
         super().__init__("reconstruction", namespace="/eschorty")
         self.declare_parameter("record", "/before")
         self.goals, self.recorded = [], []
-        self.release, self.silent = threading.Event(), False
+        self.release, self.stopped = threading.Event(), False
         self._state = LaserState(interlock_open=interlock_open)
         self._publisher = self.create_publisher(LaserState, "laser/state", qos.latched(100))
         self.create_timer(0.1, lambda: self._publisher.publish(self._state))
@@ -47,7 +47,7 @@ class Instrument(Node):
         self.goals.append(goal.request)
         self.recorded.append(self.get_parameter("record").value)
         while not self.release.wait(0.05) and not goal.is_cancel_requested:
-            if not self.silent:
+            if not self.stopped:
                 goal.publish_feedback(Scan.Feedback(phase="sweeping"))
         if goal.is_cancel_requested:
             goal.canceled()
@@ -59,7 +59,7 @@ class Instrument(Node):
 @pytest.fixture
 def world(monkeypatch):
     """A viewer that may start scans, and a way to add and remove an instrument."""
-    monkeypatch.setattr(viewer_module, "_SCANNER_SILENT_S", 1.0)
+    monkeypatch.setattr(viewer_module, "_SCANNER_TIMEOUT_S", 1.0)
     rclpy.init()
     spinning = Spinning(6)
     values = [Parameter("allow_scan", value=True), Parameter("port", value=free_port())]
@@ -145,7 +145,7 @@ def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
         with viewer.page._lock:
             viewer.page._cancel = True
         wait(says(viewer, "no scan of this page is under way"))
-        first.silent = True
+        first.stopped = True
         ask(viewer)
         wait(lambda: len(first.goals) == begun + 1)
         wait(says(viewer, "the scanner does not answer"))
