@@ -8,14 +8,13 @@ from dataclasses import replace
 from typing import Any
 
 from eschorty_ros.core.clocks import PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.evt3 import WRAP_US, first_time_high_us
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_times import (
     GAP_NS,
-    WRAP_US,
     Packet,
-    first_time_high_us,
     first_time_us,
     overtaken,
     skips_time,

@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.clocks import NS_PER_US
-from eschorty_ros.core.evt3 import begin_time, time_span_us
-from eschorty_ros.core.evt3 import words as w3
+from eschorty_ros.core.evt3 import WRAP_US, begin_time, first_time_high_us, time_span_us
 
-WRAP_US = 1 << 24
 # A decoder follows the 24-bit time over gaps of less than half a wrap.
 GAP_NS = WRAP_US * NS_PER_US // 2
 # A stream without losses skips less of its own time than this between two packets.
@@ -43,13 +39,6 @@ def check_span(data: Any) -> None:
         raise FormatError(
             f"a packet of {len(data)} bytes spans {span_us * 1e-6:.0f} s; send EVT3 as it comes"
         )
-
-
-def first_time_high_us(data: Any) -> int | None:
-    """Return the time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` without one."""
-    words = _words(data)
-    found = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
-    return int(words[found[0]] & 0xFFF) << 12 if found.size else None
 
 
 def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int | None:
@@ -95,8 +84,3 @@ def _first_word_us(data: Any, before_us: int | None) -> int | None:
     if before_us is None:
         return t_us
     return t_us + round((before_us - t_us) / WRAP_US) * WRAP_US
-
-
-def _words(data: Any) -> np.ndarray:
-    view = memoryview(data).cast("B")
-    return np.frombuffer(view[: len(view) & ~1], dtype="<u2")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.clocks import NS_PER_US
+from eschorty_ros.core.evt3 import WRAP_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Reconstructor
@@ -23,7 +24,7 @@ from eschorty_ros.core.storage import Points, ScanLog
 from eschorty_ros.core.storage.recording import STAGE_DTYPE
 from eschorty_ros.core.storage.recording_writer import RecordingWriter, make_recording_folder
 from eschorty_ros.live.job_queue import Job
-from eschorty_ros.live.packet_times import GAP_NS, WRAP_US, Packet
+from eschorty_ros.live.packet_times import GAP_NS, Packet
 from eschorty_ros.live.sensor_epoch import SensorEpoch
 
 QUEUE_BYTES = 256 << 20

@@ -8,20 +8,14 @@ from line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.clocks import PulseTrain
-from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.evt3 import WRAP_US, Decoder, first_time_high_us
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live import packet_stream
 from eschorty_ros.live.packet_stream import PacketStream
-from eschorty_ros.live.packet_times import (
-    WRAP_US,
-    Packet,
-    check_span,
-    first_time_high_us,
-    first_time_us,
-)
+from eschorty_ros.live.packet_times import Packet, check_span, first_time_us
 from eschorty_ros.live.pipeline import Pipeline
 
 ZERO_NS = 1_700_000_000_123_456_789
@@ -411,11 +405,6 @@ def test_the_phase_is_found_again_when_the_laser_is_switched_on():
 def test_time_of_a_packets_first_bytes(words, before_us, after_us, found):
     data = np.array(words, "<u2").tobytes()
     assert first_time_us(data, before_us, after_us) == (before_us if found is None else found)
-
-
-def test_first_time_high():
-    assert first_time_high_us(np.array([0x0001, 0x8003, 0x8004], "<u2").tobytes()) == 3 << 12
-    assert first_time_high_us(b"\x01") is None
 
 
 def test_an_announced_zero_that_contradicts_the_stamps_is_refused_and_counted():

@@ -8,11 +8,18 @@ from eschorty_ros.core.evt3.counters import Counters
 from eschorty_ros.core.evt3.decoder import Decoder
 from eschorty_ros.core.evt3.encoder import Encoder, sort_readout
 from eschorty_ros.core.evt3.events import EVENT_DTYPE, EventArrays, Events, Triggers
-from eschorty_ros.core.evt3.time_span import BeginTime, begin_time, time_span_us
+from eschorty_ros.core.evt3.time_span import (
+    WRAP_US,
+    BeginTime,
+    begin_time,
+    first_time_high_us,
+    time_span_us,
+)
 from eschorty_ros.core.evt3.word_count import WordCounter
 
 __all__ = [
     "EVENT_DTYPE",
+    "WRAP_US",
     "ActivityFilter",
     "BeginTime",
     "Counters",
@@ -23,6 +30,7 @@ __all__ = [
     "Triggers",
     "WordCounter",
     "begin_time",
+    "first_time_high_us",
     "sort_readout",
     "time_span_us",
 ]

@@ -12,6 +12,8 @@ from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
 
+WRAP_US = 1 << 24
+"""The sensor's time in EVT3 is modulo this."""
 # Words searched at once; TIME_HIGH is one of some hundred.
 _BLOCK = 64
 # A stream repeats its time far more often.
@@ -35,6 +37,16 @@ def begin_time(data: bytes | bytearray | memoryview) -> BeginTime:
     Raises ``ArgumentError`` for anything but bytes.
     """
     return BeginTime(*_begin(_words(data)[:_SEARCHED]))
+
+
+def first_time_high_us(data: bytes | bytearray | memoryview) -> int | None:
+    """Return the time of the first TIME_HIGH word, us modulo 2^24, ``None`` without one.
+
+    Raises ``ArgumentError`` for anything but bytes.
+    """
+    words = _words(data)
+    found = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
+    return int(words[found[0]] & 0xFFF) << 12 if found.size else None
 
 
 def time_span_us(data: bytes | bytearray | memoryview) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.reconstruction.clock_turns import in_turn
+from eschorty_ros.core.reconstruction.clock_wraps import in_wrap
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
@@ -90,7 +90,7 @@ def reconstruct_recording(
     began = time.perf_counter()
     settings = settings or recorded_settings(recording)
     check_sensor(recording)
-    recording, turned = in_turn(recording)
+    recording, wrapped = in_wrap(recording)
     settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
     jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
@@ -123,7 +123,7 @@ def reconstruct_recording(
     shown_hz = shown_frequency_hz(recording) if shown is None else shown.result()
     warnings = (
         *map(str, reader.warnings),
-        *turned,
+        *wrapped,
         *reconstructor.warnings,
         *recording_warnings(recording, used, counters, points, span_us, shown_hz),
     )

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from eschorty_ros.core.evt3 import BeginTime, Decoder, Encoder, begin_time, time_span_us
+from eschorty_ros.core.evt3 import (
+    BeginTime,
+    Decoder,
+    Encoder,
+    begin_time,
+    first_time_high_us,
+    time_span_us,
+)
 
 
 def words(*values: int) -> bytes:
@@ -14,6 +21,11 @@ def stream(t_us: np.ndarray) -> bytes:
     """Return a stream with one event at each of these times."""
     column = np.arange(t_us.size) % 1280
     return Encoder().encode(t_us, column, np.full(t_us.size, 300), np.ones(t_us.size, int))
+
+
+def test_first_time_high():
+    assert first_time_high_us(words(0x0001, 0x8003, 0x8004)) == 3 << 12
+    assert first_time_high_us(b"\x01") is None
 
 
 @pytest.mark.parametrize("begin_us", [0, 5_000, (1 << 24) - 30_000])

@@ -81,7 +81,7 @@ def test_a_dark_recording_says_so(tmp_path):
     assert "events follow the laser's modulation at 70 Hz" in found.warnings[-1]
 
 
-def test_stage_positions_of_a_later_turn_of_the_cameras_clock_are_those_of_the_events(recording):
+def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_events(recording):
     later_us, edge_us = 3 << 24, recording.modulation.on_edge_us
     later = with_stage(recording, later_us)
     modulation = replace(recording.modulation, on_edge_us=edge_us + later_us)
@@ -107,7 +107,7 @@ def test_stage_positions_of_a_later_turn_of_the_cameras_clock_are_those_of_the_e
         (lambda r: with_stage_at(r, 20.0), {}, "the stage stays at 20 mm in stage.csv", 1),
         (lambda r: with_stage_at(r, 180.0, 40), {}, "to 180 mm at 0.400 s in stage.csv; remove", 1),
         (lambda r: r.corrected(replace(NARROW, name="other")), {}, "of config_3 and reconstr", 1),
-        # In another turn of the camera's clock, and in the host's time.
+        # In another wrap of the camera's clock, and in the host's time.
         (lambda r: with_stage(r, (4 << 24) + 6_000_000), {}, "have no stage position; give the", 0),
         (lambda r: with_stage(r, 10**8 << 24), {}, "have no stage position; give the stage log", 0),
         (with_scan_elsewhere, {}, "points are outside start to stop of the recorded scan", 0),
