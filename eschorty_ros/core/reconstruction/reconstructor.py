@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -16,11 +15,11 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED
 from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.reconstruction.missing_points import missing_points
 from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
-from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, periods_max
+from eschorty_ros.core.reconstruction.profile_length import periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.readout_window import window_model, window_words
 from eschorty_ros.core.reconstruction.region import within_ranges
@@ -35,8 +34,6 @@ _PIECE_WORDS = 1 << 16
 _BLOCK_WORDS = 1 << 13
 # Most pieces with edges that are kept until ``take_stage_edges`` is called. Nothing offline does.
 _STAGE_EDGES_MAX = 1024
-# A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
-_UNMODULATED_SHARE = 0.1
 
 
 class Reconstructor:
@@ -348,73 +345,16 @@ class Reconstructor:
     @property
     def warnings(self) -> list[str]:
         """One line for each fault of the stream, and for each reason of points that miss."""
-        counts = self.counters
-        found: list[str] = []
-        every, columns = self.periods_per_profile, self.model.columns
+        counts, found = self.counters, []
         if self.phase_missing:
             found.append(
                 f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
                 "of them is used"
             )
         found += stream_faults(counts)
-        if is_unreadable(counts):
-            return found
-        learned = self.settings.phase_gate_us == GATE_LEARNED
-        if 2 * counts["events_gated"] > counts["events"] and not learned:
-            share = counts["events_gated"] / counts["events"]
-            found.append(
-                f"phase_gate_us removes {share:.0%} of the events; set it to 0, or check the "
-                f"frequency ({self.modulation.frequency_hz:g} Hz) and the polarity of the events"
-            )
-            return found
-        unmodulated, points = counts["columns_unmodulated"], counts["points"]
-        share = unmodulated / max(points + unmodulated, 1)
-        # Background of dark columns, beside those of a line, has fewer events than these.
-        line = counts["events_binned"] - counts["events_unmodulated"]
-        dark = 2 * counts["events_unmodulated"] * points < line * unmodulated
-        dark &= unmodulated < 10 * points
-        # As the laser is switched on, and off, a period has no phase.
-        switched = 2 * columns if points else 0
-        if share > _UNMODULATED_SHARE and not dark and unmodulated > switched:
-            found.append(
-                f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
-                f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
-                "check frequency and laser, or choose a lower frequency where pixels are too slow"
-            )
-        cut = counts["points_cut"]
-        if 2 * cut > points:
-            found.append(
-                f"the sensor's edge cuts the line in {cut / max(points, cut):.0%} of the points; "
-                "move the surface nearer to the middle of the ranges"
-            )
-        if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
-            found.append(
-                "the line is more than 1.5 times as wide as line_width_px = "
-                f"{self.settings.line_width_px:g} in {counts['profiles_too_wide']} of "
-                f"{counts['periods_closed']} profiles; focus the laser, or raise line_width_px"
-                + ("" if learned else "; where background makes it wide set phase_gate_us to -1")
-            )
-        per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
-        few = counts["columns_too_few_events"]
-        if 2 * counts["events_outside_roi"] > counts["events"] and few >= 10 * points:
-            share = counts["events_outside_roi"] / counts["events"]
-            found.append(
-                f"{share:.0%} of the events are outside the limits of columns and ranges; widen "
-                "column_first, column_last, range_min or range_max"
-            )
-        elif few > 10 * points and per_column < EVENTS_WANTED:
-            most = periods_max(self.modulation)
-            wanted = min(math.ceil(every * EVENTS_WANTED / max(per_column, 1e-3)), most)
-            found.append(
-                f"{few} columns have too few events for a point, {per_column:.2g} per column and "
-                f"profile on average; set periods_per_profile to about {wanted}"
-            )
-        if self.settings.periods_per_profile == 0 and every > 1:
-            found.append(
-                "a column has too few events for a point in one period, or others in the next; "
-                f"{every} periods make a profile, "
-                f"{self.modulation.frequency_hz / every:.4g} profiles per second"
-            )
+        if not is_unreadable(counts):
+            stream = self.modulation, self.model.columns, self.periods_per_profile
+            found += missing_points(counts, self.settings, *stream)
         return found
 
     @property
