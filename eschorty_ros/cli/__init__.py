@@ -67,7 +67,7 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except EschortyError as error:
-            raise StatedFailure(" ".join(str(error).split())) from error
+            raise StatedFailure(str(error)) from error
         except BrokenPipeError:
             # The reader of the output closed it; click ends without a message.
             raise

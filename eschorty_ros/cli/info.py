@@ -205,7 +205,7 @@ def _raw(path: Path) -> tuple[int, int] | None:
     window_s = min(PEAK_WINDOW_US * 1e-6, seconds)
     peak = max(busiest.values(), default=0) / window_s if window_s else 0.0
     rows = {
-        "format": f"{header.format}, {header.width} x {header.height}",
+        "format": f"EVT3, {header.width} x {header.height}",
         "events": f"{events:,} ({on:,} on, {events - on:,} off)",
         "time": f"{first_us * 1e-6:.6f} to {last_us * 1e-6:.6f} s ({seconds:.3f} s)",
         "mean rate": f"{events / seconds if seconds else 0.0:.4g} events/s",

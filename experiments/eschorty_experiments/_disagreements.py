@@ -81,7 +81,7 @@ def _of_scans(made: dict[str, Design]) -> list[list[str]]:
     nominal = made["nominal"]
     step = {name: float(build.model.range_per_row_mm(1320.0)) for name, build in made.items()}
     axis_m = nominal.axis_range_mm * 1e-3
-    pitch_rad = nominal.column_pitch_rad
+    pitch_rad = nominal.model.slope_per_column
     focus_mm = float(nominal.at([1320.0]).depth_of_field_mm[0])
     return [
         [

@@ -21,9 +21,9 @@ DEPTH_MAX = 20
 NUMBER_MAX = 60
 """Characters of a number."""
 
-_ENTRY = "tag:yaml.org,2002:"
+_TAG_PREFIX = "tag:yaml.org,2002:"
 _RESOLVER = yaml.resolver.Resolver()
-_NUMBERS = yaml.constructor.SafeConstructor()
+_SCALARS = yaml.constructor.SafeConstructor()
 
 Keys = tuple[str | int, ...]
 
@@ -159,11 +159,11 @@ class _Builder:
 def _scalar(event: yaml.ScalarEvent) -> Any:
     """Return text, a number, a truth value or ``None``; dates stay text."""
     tag = _RESOLVER.resolve(yaml.ScalarNode, event.value, event.implicit)
-    kind = tag.removeprefix(_ENTRY)
+    kind = tag.removeprefix(_TAG_PREFIX)
     if kind == "null":
         return None
     if kind == "bool":
-        return _NUMBERS.bool_values[event.value.lower()]
+        return _SCALARS.bool_values[event.value.lower()]
     if kind not in ("int", "float"):
         return event.value
     if len(event.value) > NUMBER_MAX:
@@ -171,7 +171,7 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     node = yaml.ScalarNode(tag, event.value)
     try:
         if kind == "int":
-            return _NUMBERS.construct_yaml_int(node)
-        return _NUMBERS.construct_yaml_float(node)
+            return _SCALARS.construct_yaml_int(node)
+        return _SCALARS.construct_yaml_float(node)
     except (ValueError, ArithmeticError, LookupError):
         raise _Refused(event, f"{short(event.value)} is no number") from None

@@ -19,7 +19,7 @@ RETURNS = ("strongest", "first", "last", "all")
 
 # Codes are indices of the tuples above.
 _MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
-_STRONGEST, _FIRST, _LAST, _ALL = range(4)
+_STRONGEST, _, _LAST, _ALL = range(4)
 
 FWHM_PER_SIGMA = 2.3548200450309493
 # Least half width of a window, fixed point.

@@ -76,12 +76,7 @@ class Design:
     @property
     def field_deg(self) -> float:
         """Full scan angle of all columns, seen from the front focal line, degrees."""
-        return 2.0 * math.degrees(math.atan(0.5 * self.model.columns * self.column_pitch_rad))
-
-    @property
-    def column_pitch_rad(self) -> float:
-        """Scan angle of one column, ``p / k``, radians."""
-        return self.model.pixel_um * 1e-3 / self.model.k_mm
+        return 2.0 * math.degrees(math.atan(0.5 * self.model.columns * self.model.slope_per_column))
 
     @property
     def depth_of_field_rows(self) -> float:

@@ -181,7 +181,7 @@ class RangeModel:
 
     @property
     def slope_per_column(self) -> float:
-        """Lateral offset per column and mm of depth, ``p / k``."""
+        """Scan angle of one column, radians: lateral offset per mm of depth, ``p / k``."""
         return self.pixel_um * 1e-3 / self.k_mm
 
     def normalised_column(self, column: ArrayLike) -> Array:

@@ -30,14 +30,13 @@ class Header(Mapping[str, str]):
     """The header's keys and values as written, plus their meaning.
 
     ``width``, ``height`` : sensor size in pixels (1280 x 720 when the file has none).
-    ``format`` : always ``"EVT3"``. ``size_bytes`` : offset of the first word.
+    ``size_bytes`` : offset of the first word.
     """
 
     def __init__(self, values: dict[str, str], width: int, height: int, size_bytes: int) -> None:
         self._values = values
         self.width = width
         self.height = height
-        self.format = "EVT3"
         self.size_bytes = size_bytes
 
     def __getitem__(self, key: str) -> str:
@@ -92,9 +91,6 @@ class RawReader:
         """
         integer("size", size, 1, 1 << 40)
         return self._chunks(size, integer("begin", begin, 0, 1 << 62))
-
-    def __iter__(self) -> Iterator[bytes]:
-        return self.chunks()
 
     def mapped(self, size: int) -> Iterator[memoryview]:
         """Iterate over the words' bytes as `chunks` does, without copies: views of a memory map.

@@ -286,11 +286,11 @@ class InstrumentClient(PacedWaiting):
         self,
         name: str,
         request: Any,
-        once_within_s: float | None = None,
-        within_s: float | None = None,
+        timeout_s: float | None = None,
+        repeat: bool = True,
     ) -> Any:
-        """Return a service's answer; the request is repeated unless ``once_within_s`` is given."""
-        call = RepeatedCall(self._clients[name], request, again=once_within_s is None)
+        """Return a service's answer; with ``repeat`` a request without one is sent again."""
+        call = RepeatedCall(self._clients[name], request, again=repeat)
 
         def answered() -> bool:
             if name.startswith("reconstruction/"):
@@ -298,7 +298,7 @@ class InstrumentClient(PacedWaiting):
             with self._shutdown_as_failure():
                 return call.done()
 
-        self._await(answered, name, once_within_s or within_s or self._service_timeout_s)
+        self._await(answered, name, timeout_s or self._service_timeout_s)
         return call.result()
 
     @contextlib.contextmanager
@@ -336,14 +336,14 @@ class ScanClient(InstrumentClient):
         self.monitor.restart_samples(self._now_ns())
         # A cancel before the answer would leave a scan that is never ended.
         with self.shielded():
-            answer = self._call("reconstruction/begin_scan", begin, within_s=_BEGIN_S)
+            answer = self._call("reconstruction/begin_scan", begin, _BEGIN_S)
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")
 
     def end_scan(self, scan_id: str) -> ScanSummary:
         """See ``ScanInstrument``."""
         request = EndScan.Request(scan_id=scan_id)
-        answer = self._call("reconstruction/end_scan", request, once_within_s=_ASSEMBLE_S)
+        answer = self._call("reconstruction/end_scan", request, _ASSEMBLE_S, repeat=False)
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")
         return ScanSummary(answer.profiles, answer.points, answer.events, answer.packets_lost,

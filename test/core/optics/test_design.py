@@ -57,7 +57,7 @@ def test_nominal_table() -> None:
     assert table.in_view.tolist() == [False, True, True, True, True, False]
     assert d.axis_range_mm == pytest.approx(2441.0, abs=0.5)
     assert d.field_deg == pytest.approx(14.73, abs=6e-3)
-    assert 1e6 * d.column_pitch_rad == pytest.approx(202.0, abs=0.1)
+    assert 1e6 * d.model.slope_per_column == pytest.approx(202.0, abs=0.1)
 
 
 def test_config_3_sampling_and_view() -> None:
