@@ -154,7 +154,7 @@ class PacketStream:
 
     @property
     def warnings(self) -> list[str]:
-        """Return why most of the events gave no points so far, one line for each reason."""
+        """Return the warnings about the stream so far, one line for each reason."""
         reconstructor, wanted = self._reconstructor, self._settings.periods_per_profile
         if reconstructor is None:
             return []

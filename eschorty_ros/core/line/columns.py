@@ -21,13 +21,16 @@ _ALL_ROWS = np.empty(0, np.uint32)
 class Columns(NamedTuple):
     """Packed events by column: ``counts[c]`` of them from ``starts[c]`` on.
 
-    Behind those of all columns are the late ones of a `PhaseGate` that keeps them. The ``room`` for
-    the events of a column grows up to ``limit``. ``seeds`` are the rows of the lines
-    in the last period, fixed point; -1 for none. ``rivals`` are those of second lines that are
-    nearly as strong, and ``evidence`` the events by which the first ones have been stronger, which
-    have had ``events``; 0 for none. In a
-    region of interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it;
-    without one both are empty. ``refused`` counts the events that `_bin` did not append, by reason.
+    Behind those of all columns are the late ones of a `PhaseGate` that keeps them.
+
+    - ``seeds``: Row of the line in the last period, fixed point; -1 for none.
+    - ``rivals``: Row of a second line that is nearly as strong; -1 for none.
+    - ``evidence``: Events that the first line has had more than the second; 0 for none.
+    - ``events``: Events of the first line.
+    - ``room``, ``limit``: Room for the events of a column, and what it may grow to.
+    - ``row_first``, ``row_span``: In a region of interest the first row that a column takes, and
+      how many rows behind it; empty without one.
+    - ``refused``: Events that `_bin` did not append, by reason.
     """
 
     packed: NDArray[np.uint32]

@@ -2,13 +2,11 @@
 
 An event is one uint32: the row in the low 10 bits, the polarity above them, the time since the
 period's edge (us) in the upper 21. A column's events are padded with ``PAD`` to a multiple of
-``BLOCK`` entries, so that the
-inner loops run on full vector registers without a remainder.
+``BLOCK`` entries, so that the inner loops run on full vector registers without a remainder.
 
 All sums are integers, hence exact and independent of the order of the events and of the origin of
-the rows. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places,
-rounded half to even: mirroring the rows mirrors every window exactly. Half widths and gaps are
-fixed-point numbers, too.
+the rows. Window centres, half widths and gaps are fixed-point numbers with ``FRACTION_BITS`` binary
+places. Centres are rounded half to even: mirroring the rows mirrors every window exactly.
 """
 
 from __future__ import annotations
