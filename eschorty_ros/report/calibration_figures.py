@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eschorty_ros.core.base.arrays import Array
-from eschorty_ros.core.calibration import WIDTH_BIAS, CalibrationReport
+from eschorty_ros.core.calibration import SIGMA_ROW_PX, WIDTH_BIAS, CalibrationReport
 from eschorty_ros.core.optics import depth_of_field_mm
 from eschorty_ros.report.figures import new_figure
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIGMA_ROW_PX = 0.3
-"""Centroid error for which the sigma of a range is drawn."""
 # More targets than _MANY are drawn small; at most _FEW rejected ones get a number.
 _MANY, _FEW = 60, 6
 SYMBOLS = {

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eschorty_ros.core.calibration import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS, CalibrationReport
+from eschorty_ros.core.calibration import (
+    COLUMN_TERMS,
+    PARAMETERS,
+    SIGMA_ROW_PX,
+    WIDTH_BIAS,
+    CalibrationReport,
+)
 from eschorty_ros.report import calibration_figures as drawn
 from eschorty_ros.report.figures import DPI
 from eschorty_ros.report.page import number, render
@@ -156,6 +162,6 @@ def _sigmas(report: CalibrationReport) -> list[list[float]]:
         ranges,
         model.range_per_row_mm(ranges),
         report.range_sigma_mm(rows),
-        report.range_sigma_mm(rows, drawn.SIGMA_ROW_PX),
+        report.range_sigma_mm(rows, SIGMA_ROW_PX),
     )
     return [[float(column[i]) for column in columns] for i in range(ROWS_SHOWN)]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.calibration import Targets
+from eschorty_ros.core.calibration import SIGMA_ROW_PX, Targets
 from eschorty_ros.core.optics import RangeModel
 
-SIGMA_ROW_PX = 0.3
 SIGMA_RANGE_MM = 1.0
 SIGMA_WIDTH_PX = 0.42
 
