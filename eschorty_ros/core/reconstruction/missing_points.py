@@ -58,8 +58,8 @@ def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int
         return ""
     return (
         f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
-        f"follow the laser at {modulation.frequency_hz:g} Hz and gave no points; "
-        "check frequency and laser, or choose a lower frequency where pixels are too slow"
+        f"follow the laser at {modulation.frequency_hz:g} Hz and gave no points; check its "
+        "frequency, duty cycle and polarity, or choose a lower frequency where pixels are too slow"
     )
 
 

@@ -199,6 +199,9 @@ def _few_points(
         # The reconstructor has a line for it.
         return []
     lost = max(_LOSSES, key=lambda name: counters[name])
+    if modulated and not len(points) and counters["columns_unmodulated"] > counters[lost]:
+        # It has one for this, too.
+        return []
     if 2 * counters["events_filtered"] > counters["events"]:
         words, count = _FILTERED, counters["events_filtered"]
     else:

@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
+from eschorty_ros.core.evt3 import words as w3
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
-from eschorty_ros.core.storage import ScanLog
+from eschorty_ros.core.storage import ScanLog, load_recording
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -61,6 +64,19 @@ def with_broken_words(recording):
 def with_scan_elsewhere(recording):
     scan = ScanLog(scan_id="s", state="ended", start_mm=500.0, stop_mm=600.0)
     return replace(recording, scan=scan)
+
+
+def test_a_light_of_the_other_polarity_has_its_reason_alone(tmp_path):
+    """ON events come where OFF ones are expected, four fifths of a period later."""
+    short = Modulation(70.0, 0.2)
+    recording = simulate_recording(tmp_path, Plane(1300.0), NARROW, short, stop_mm=30.0, seed=2)
+    data = recording.events_path.read_bytes()
+    begin = data.index(b"% end\n") + 6
+    words = np.frombuffer(data[begin:], "<u2").copy()
+    words[np.isin(words >> 12, (w3.ADDR_X, w3.VECT_BASE_X))] ^= w3.ADDRESSES
+    recording.events_path.write_bytes(data[:begin] + words.tobytes())
+    (line,) = reconstruct_recording(load_recording(tmp_path)).warnings
+    assert "check its frequency, duty cycle and polarity" in line
 
 
 @pytest.mark.parametrize("scene", ["plane", "posts"])
