@@ -5,37 +5,35 @@ from __future__ import annotations
 import math
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from eschorty_ros.core.base.progress import Progress
     from eschorty_ros.report.accuracy import Accuracy
 
 LINE_EVERY_S = 5.0
 LESS_THAN_ALL = 0.99
 
-Report = Callable[[float, str], None]
-"""Called with the share done (0 to 1) and a short text."""
-
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Report]:
+def progress_bar(title: str) -> Iterator[Progress]:
     """Show the share done on stderr: a bar on a terminal, else a line when it has changed.
 
     The share stays below 100 % until the block ends. Lines are some seconds apart.
     """
+    from rich import progress
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+    bar = progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TextColumn("{task.percentage:3.0f} %"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[note]}"),
         console=Console(file=sys.stderr),
         transient=True,
         disable=not sys.stderr.isatty(),

@@ -58,7 +58,7 @@ def command(
     refuse_given(("frequency", "calibration", "packet_period"), "is for a bag; SOURCE is none")
     recording = load_recording(source)
     with progress_bar("converting") as report:
-        recording_to_bag(recording, target, storage, lambda share: report(share, ""))
+        recording_to_bag(recording, target, storage, report)
     click.echo(str(target))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.cluster import on_cluster
-from eschorty_ros.cli.console import Report, accuracy_rows, pairs, progress_bar, warn
+from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
@@ -21,6 +21,7 @@ from eschorty_ros.cli.options import Number, recorded_options, refuse_given, sta
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
+    from eschorty_ros.core.base.progress import Progress
     from eschorty_ros.core.reconstruction import Result
     from eschorty_ros.core.storage import Recording
     from eschorty_ros.report.accuracy import Accuracy
@@ -230,7 +231,7 @@ def reconstruct_to(
         return _reconstruct(load_recording(folder), target, jobs, given, show)
 
 
-def _progress(title: str, show: bool) -> AbstractContextManager[Report]:
+def _progress(title: str, show: bool) -> AbstractContextManager[Progress]:
     return progress_bar(title) if show else nullcontext(lambda share, note: None)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import yaml
 from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
 from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.base.schema import validate
 from eschorty_ros.core.base.yaml_file import Document, parse_yaml
 from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, StageTrack
@@ -41,8 +41,6 @@ from eschorty_ros.live.scan_recorder import ScanRecorder
 
 _SCAN, _SETTINGS = "eschorty_scan", "eschorty_settings"
 _DISK_S = 600.0
-
-Progress = Callable[[float], Any]
 
 
 def bag_to_recording(
@@ -189,7 +187,7 @@ def recording_to_bag(
 
     - ``bag``: Folder of the bag, made here.
     - ``storage``: ``mcap`` or ``sqlite3``.
-    - ``progress``: Called with the share done.
+    - ``progress``: See `Progress`.
 
     Raises ``ArgumentError`` when the bag exists or cannot be written.
     """
@@ -258,5 +256,5 @@ def _write(recording: Recording, target: BagWriter, progress: Progress | None) -
         seq += 1
         done += len(packet.data)
         if progress is not None:
-            progress(done / total)
+            progress(done / total, "")
     stage(int(rows["t_us"][-1]))

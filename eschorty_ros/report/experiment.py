@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Progress = Callable[[float, str], None]
-"""Called with the share done (0 to 1) and a few words."""
+    from eschorty_ros.core.base.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.report import figures
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -19,7 +20,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 
 if TYPE_CHECKING:

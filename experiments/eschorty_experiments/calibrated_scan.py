@@ -11,6 +11,7 @@ import numpy as np
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.calibration import (
     CalibrationReport,
     KnownTarget,
@@ -29,7 +30,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.simulation.scenes import Plane, Posts, Scene, Steps

@@ -26,6 +26,7 @@ from eschorty_experiments._calibration_runs import (
     outliers,
 )
 from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -33,7 +34,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_experiments._scan_errors import scan_errors
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
@@ -20,7 +21,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.simulation.scenes import Plane, Scene, Steps

@@ -20,6 +20,7 @@ from eschorty_experiments._estimator_figures import (
     bounds_figure,
     returns_figure,
 )
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.line import FWHM_PER_SIGMA, METHODS, estimate
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -27,7 +28,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 
 WIDTHS_PX = (2.0, 5.0, 10.0, 20.0)

@@ -14,13 +14,13 @@ from eschorty_experiments._line_width import (
     closed_form_width,
     measure,
 )
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.simulation.pixels import PixelParameters, preset

@@ -15,6 +15,7 @@ from eschorty_experiments._posts import (
     measure_posts,
     pulls,
 )
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.optics import Design
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -22,7 +23,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 

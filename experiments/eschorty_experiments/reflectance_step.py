@@ -21,13 +21,13 @@ from eschorty_experiments._step_figures import (
     reflectance_figure,
     step_figure,
 )
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.simulation.pixels import PixelParameters, preset
 

@@ -18,6 +18,7 @@ from eschorty_experiments._leaf_levels import (
     level_steps,
 )
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Result, reconstruct_recording
@@ -28,7 +29,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.simulation.scenes import Face, Leaves
 from eschorty_ros.simulation.world import simulate_recording

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_experiments._scan_errors import period_of, scan_errors
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.line import METHODS
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
@@ -25,7 +26,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.simulation.scenes import Plane, Scene, named
 from eschorty_ros.simulation.world import simulate_recording

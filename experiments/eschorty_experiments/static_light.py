@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.line import estimate
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -14,7 +15,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.simulation.pixels import PixelArray, preset, unpack

@@ -9,6 +9,7 @@ import numpy as np
 
 from eschorty_experiments._builds import BEAM_MRAD, beam_rows, builds
 from eschorty_experiments._disagreements import disagreements
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.optics import Design, load_calibration
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -16,7 +17,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 from eschorty_ros.report.figures import new_figure
 

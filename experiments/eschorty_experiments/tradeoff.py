@@ -34,6 +34,7 @@ from eschorty_experiments._tradeoff_tables import (
     summary,
     summary_table,
 )
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.optics import COLUMNS
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -41,7 +42,6 @@ from eschorty_ros.report.experiment import (
     Experiment,
     Finding,
     Outcome,
-    Progress,
 )
 
 TRAVEL_MM = (70.0, 130.0)

@@ -69,7 +69,7 @@ def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
 
 
 def test_an_interrupted_conversion_leaves_no_bag(tmp_path, source):
-    def interrupt(share):
+    def interrupt(share, note):
         if share > 0.3:
             raise KeyboardInterrupt
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.action import Calibrate
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.nodes.one_process.composition import (
-    Feedback,
     bench_options,
     bench_parameters,
     composition,
@@ -52,7 +52,7 @@ class CalibrationResult:
     """Shape (rows, columns). All events of the capture."""
 
 
-def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult:
+def calibrate_once(job: CalibrationJob, feedback: Progress) -> CalibrationResult:
     """Run all nodes on emulated devices, calibrate once through the action, end them.
 
     Raises ``DeviceError`` when a node fails, or the action refuses the goal or takes far too long.

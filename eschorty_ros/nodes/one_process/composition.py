@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.base.files import temporary_folder
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.emulation.bench.process import bench_process
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
@@ -48,9 +49,6 @@ FEEDBACK_TIMEOUT_S = 300.0
 
 Tables = dict[str, dict[str, Any]]
 """Parameters by node."""
-
-Feedback = Callable[[float, str], None]
-"""Receives the share done and a line of text."""
 
 
 def bench_parameters() -> Tables:
@@ -91,7 +89,7 @@ class Composition:
         self._spinning = spinning
         self._action = action
 
-    def wait_until_active(self, feedback: Feedback) -> None:
+    def wait_until_active(self, feedback: Progress) -> None:
         """Wait until every node is active and the action's server has been discovered.
 
         ``feedback`` is called with what is missing. Raises ``DeviceError`` when a node failed or
@@ -108,7 +106,7 @@ class Composition:
             lambda: "; ".join(("the nodes are not active", *self._waiting())),
         )
 
-    def result(self, goal: Any, on_feedback: Callable[[Any], None], starting: Feedback) -> Any:
+    def result(self, goal: Any, on_feedback: Callable[[Any], None], starting: Progress) -> Any:
         """Send a goal once all nodes are active; return its result. An interruption cancels it.
 
         ``starting`` is called with what is missing until then.

@@ -12,10 +12,10 @@ from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import ScanRequest, check_request
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, finite_points
 from eschorty_ros.nodes.one_process.composition import (
     START_S,
-    Feedback,
     Tables,
     bench_options,
     bench_parameters,
@@ -85,7 +85,7 @@ def check_job(job: ScanJob) -> None:
     check_request(request, limits, "mm")
 
 
-def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
+def scan_once(job: ScanJob, feedback: Progress) -> ScanResult:
     """Run all nodes, scan once through the action, end them; the laser is off on every exit.
 
     Raises ``DeviceError`` when a node fails, or the scanner refuses the goal or takes far too long.
