@@ -92,6 +92,9 @@ class RawReader:
         integer("size", size, 1, 1 << 40)
         return self._chunks(size, integer("begin", begin, 0, 1 << 62))
 
+    def __iter__(self) -> Iterator[bytes]:
+        return self.chunks()
+
     def mapped(self, size: int) -> Iterator[memoryview]:
         """Iterate over the words' bytes as `chunks` does, without copies: views of a memory map.
 

@@ -20,7 +20,7 @@ def reader_of(tmp_path: Path, content: bytes) -> RawReader:
 
 def test_new_header_without_warning(tmp_path: Path) -> None:
     reader = reader_of(tmp_path, NEW + WORDS)
-    assert b"".join(reader.chunks()) == WORDS
+    assert b"".join(reader) == WORDS
     assert (reader.header.width, reader.header.height) == (1280, 720)
     assert reader.header["evt"] == "3.0"
     assert set(reader.header) == {"evt", "format", "geometry"}
@@ -37,7 +37,7 @@ def test_old_header_without_end(tmp_path: Path) -> None:
 
 def test_words_that_look_like_a_header_line(tmp_path: Path) -> None:
     data = b"% looks like a line\n"
-    assert b"".join(reader_of(tmp_path, NEW + data).chunks()) == data
+    assert b"".join(reader_of(tmp_path, NEW + data)) == data
 
 
 def test_chunks_have_the_size_asked_for(tmp_path: Path) -> None:
@@ -56,8 +56,8 @@ def test_a_mapped_file_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_odd_byte_is_a_warning(tmp_path: Path) -> None:
     reader = reader_of(tmp_path, NEW + WORDS[:-1])
-    assert b"".join(reader.chunks()) == WORDS[:-1]
-    list(reader.chunks())
+    assert b"".join(reader) == WORDS[:-1]
+    list(reader)
     assert len(reader.warnings) == 1
     assert "middle of a word" in reader.warnings[0]
 
@@ -65,7 +65,7 @@ def test_odd_byte_is_a_warning(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("content", "said"), [(NEW, "no events"), (WORDS, "no header")])
 def test_a_header_or_events_alone_are_a_warning(tmp_path: Path, content: bytes, said: str) -> None:
     reader = reader_of(tmp_path, content)
-    assert b"".join(reader.chunks()) == content.removeprefix(NEW)
+    assert b"".join(reader) == content.removeprefix(NEW)
     assert said in reader.warnings[0]
 
 
@@ -103,7 +103,7 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
         writer.write(WORDS)
     assert writer.bytes_written == 16
     reader = RawReader(path)
-    assert b"".join(reader.chunks()) == WORDS * 2
+    assert b"".join(reader) == WORDS * 2
     assert reader.warnings == []
     assert {
         "serial_number": "00000000", "sensor_name": "IMX636", "system_ID": "49",
