@@ -19,6 +19,13 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
+# What needs nothing of each other goes side by side.
+ifeq ($(MAKELEVEL)$(filter -j%,$(MAKEFLAGS)),0)
+MAKEFLAGS += --jobs=3
+endif
+ifneq ($(filter test,$(MAKECMDGOALS)),)
+MAKEFLAGS += --output-sync=line
+endif
 # Containers often set it; every process would compile numba and all the rest again, for a second.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -49,7 +56,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-scans test-single test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-pure test-devices test-scans test-rest test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -87,22 +94,29 @@ faults: $(SETUP)
 reference: $(SETUP)
 	@$(ENTER) python docs/interfaces.py && python docs/policies.py
 
-# Pure parts share the cores, the longest first; then whole scans beside single nodes and devices. The
-# emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once
-# more, all of it after a test that hung.
+# Nodes and devices that need no kernels go beside compiling or the pure parts, which share the cores, the
+# longest first; then whole scans go beside the rest. The emulated bench runs in real time, and a computer
+# that stalls fails a scan: what failed runs once more, all of it after a test that hung.
 PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
-SCANS := $(addprefix test/,cli launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
-SINGLE := test $(addprefix --ignore=,$(PURE) $(SCANS))
+DEVICES := $(addprefix test/,hardware nodes/laser nodes/stage)
+SCANS := $(addprefix test/,launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
+REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS))
+test-%: run = pytest $(tests) -o cache_dir=$(BUILD)/$@
+test-devices: tests := $(DEVICES)
+test-scans: tests := $(SCANS)
+test-rest: tests := $(REST)
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
 else
-test: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
-	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=line test-scans test-single
+test: test-scans test-rest
 
-test-scans test-single: run = pytest $(if $(filter %scans,$@),$(SCANS),$(SINGLE)) -o cache_dir=$(BUILD)/$@
-test-scans test-single: $(SETUP) $(BUILD)/test.stamp
+test-scans test-rest: test-pure test-devices
+
+test-pure: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
+	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
+
+test-devices test-scans test-rest: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) $(run) --cache-clear || { (($$? == 1)) && echo "Once more:" && $(run) --last-failed; }
 endif
 
