@@ -26,6 +26,8 @@ from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 _HELD_MAX = 1000
 # Packets without a TIME_HIGH, which a sensor repeats every 4 ms at least, that a decoder waits for.
 _TIMELESS_MAX = 64
+# Share by which a frequency differs from the same one read back.
+_OTHER_FREQUENCY = 1e-3
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -62,6 +64,7 @@ class PacketStream:
     - ``announcements_refused``: Announced zeros that contradict the packets' stamps, which serve
       instead.
     - ``announcement_expected``: True while packets wait for an announcement of the camera's zero.
+    - ``laser_hz``: Frequency that the laser reports, 0 while unknown; only compared.
     """
 
     def __init__(
@@ -80,6 +83,7 @@ class PacketStream:
         self.clock_restarts = 0
         self.announcements_refused = 0
         self.announcement_expected = True
+        self.laser_hz = 0.0
         self._packet_period_ns = round(packet_period_s * 1e9)
         self._settings = settings
         self._clock_timeout_s = clock_timeout_s
@@ -98,6 +102,8 @@ class PacketStream:
         self._source = b""
         self._last_stamp_ns = 0
         self._retired: Counter[str] = Counter()
+        self._counts_before: dict[str, int] = {}
+        self._last_warnings: list[str] | None = None
         self._out: list[TimedProfiles] = []
 
     @property
@@ -154,13 +160,28 @@ class PacketStream:
 
     @property
     def warnings(self) -> list[str]:
-        """Return the warnings about the stream so far, one line for each reason."""
+        """Return the warnings about the light that is on or was last, one line for each reason.
+
+        Where it is not known when the laser is on they are about the stream since the scan began.
+        """
+        if self._last_warnings is not None:
+            return self._last_warnings
         reconstructor, wanted = self._reconstructor, self._settings.periods_per_profile
         if reconstructor is None:
             return []
         used = reconstructor.settings.periods_per_profile
         limited = f"periods_per_profile is {wanted}; {self.frequency_hz:g} Hz allows {used}"
-        return [*([limited] if used < wanted else []), *reconstructor.warnings]
+        lines = [limited] if used < wanted else []
+        if abs(self.frequency_hz / (self.laser_hz or self.frequency_hz) - 1.0) > _OTHER_FREQUENCY:
+            lines.append(
+                f"frequency is {self.frequency_hz:g} Hz and the laser reports {self.laser_hz:g} "
+                "Hz; correct it, or set it to 0"
+            )
+        return [*lines, *reconstructor.warnings_since(self._counts_before)]
+
+    def _restart_warnings(self) -> None:
+        self._last_warnings, reconstructor = None, self._reconstructor
+        self._counts_before = {} if reconstructor is None else reconstructor.counters
 
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
@@ -181,6 +202,7 @@ class PacketStream:
         self._recorder = recorder
         if recorder is not None:
             self._renew()
+        self._restart_warnings()
         if self._zero_ended and self._epoch is not None and self._epoch.clock.exact:
             self._retire()
             self._epoch = None
@@ -199,6 +221,9 @@ class PacketStream:
         restarts then, unless ``epoch_ns`` gives it.
         """
         switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
+        if on_since_ns is None and self._on_since_ns is not None:
+            # Periods without light have few events, and follow no laser.
+            self._last_warnings = self.warnings
         self._on_since_ns = on_since_ns
         changed = (modulation, epoch_ns) != self._laser
         self._laser = modulation, epoch_ns
@@ -209,6 +234,8 @@ class PacketStream:
                 self._reconstructor.set_modulation(self._modulation())
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
+        if switched_on:
+            self._restart_warnings()
         if self._recorder is not None and switched_on:
             self._recorder.laser_on()
 
@@ -412,6 +439,7 @@ class PacketStream:
         self._collect(reconstructor.flush())
         # In this order, as other threads read the counters.
         self._reconstructor = None
+        self._counts_before = {}
         self._retired.update(reconstructor.counters)
 
     def _collect(self, profiles: Profiles) -> None:

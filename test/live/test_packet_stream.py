@@ -43,6 +43,12 @@ def stream(settings=None):
     return PacketStream(CALIBRATION, settings or Settings(), clock_timeout_s=1.0)
 
 
+def push(made, items):
+    for item in items:
+        made.add(item, 0.0)
+    return made.process(0.0)
+
+
 def joined(parts):
     return Profiles.concatenate([part.profiles for part in parts])
 
@@ -504,3 +510,47 @@ def test_profiles_that_wait_for_the_stage_keep_their_calibration():
     # The exchange closes the open period, too.
     np.testing.assert_array_equal(placed[True][: len(before)], before)
     assert np.all(placed[True]["y"] > 0.0)
+
+
+def test_warnings_are_about_the_light_that_is_on_or_was_last():
+    """Periods without light have few events; where the frequency is given, no light is reported."""
+    rng, dark_us = np.random.default_rng(5), (200_000, 1_500_000)
+    n = 300_000
+    dark = encoded(
+        (
+            np.sort(rng.integers(*dark_us, n)),
+            rng.integers(0, 1280, n),
+            rng.integers(0, 720, n),
+            rng.integers(0, 2, n),
+        )
+    )
+    lit = packets(line())
+    later = packets(dark, seq=len(lit), stamp_ns=ZERO_NS + 200_000_000)
+    made = stream(Settings(periods_per_profile=1))
+    made.announce_zero(ZERO_NS)
+    epoch_ns = ZERO_NS + EDGE_US * 1000
+    made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS)
+    push(made, lit)
+    made.set_laser(MODULATION, epoch_ns, None)
+    push(made, later)
+    made.flush()
+    assert made.warnings == [], "seeds 3 and 5"
+    made.begin_scan()
+    assert made.warnings == []
+    without = stream(Settings(periods_per_profile=1))
+    without.announce_zero(ZERO_NS)
+    without.set_laser(MODULATION, epoch_ns)
+    push(without, lit + later)
+    without.flush()
+    assert any("have too few events for a point" in text for text in without.warnings)
+
+
+def test_a_frequency_other_than_the_lasers_has_a_warning():
+    made = stream()
+    made.announce_zero(ZERO_NS)
+    made.set_laser(Modulation(140.0), ZERO_NS + EDGE_US * 1000)
+    push(made, packets(line()))
+    made.laser_hz = 140.0
+    assert not [text for text in made.warnings if "the laser reports" in text]
+    made.laser_hz = 70.0
+    assert "frequency is 140 Hz and the laser reports 70 Hz" in made.warnings[0]

@@ -24,7 +24,9 @@ def missing_points(
     """Return one line for each reason; ``counts`` are the counters of a `Reconstructor`."""
     if gated := _gated(counts, settings, modulation):
         return [gated]
-    few = _outside_region(counts) or _few_events(counts, modulation, columns, periods_per_profile)
+    few = _outside_region(counts)
+    if settings.periods_per_profile:
+        few = few or _few_events(counts, modulation, columns, periods_per_profile)
     reasons = (
         _unmodulated(counts, modulation, columns),
         _cut(counts),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -345,7 +345,12 @@ class Reconstructor:
     @property
     def warnings(self) -> list[str]:
         """One line for each fault of the stream, and for each reason of points that miss."""
-        counts, found = self.counters, []
+        return self.warnings_since({})
+
+    def warnings_since(self, before: Mapping[str, int]) -> list[str]:
+        """Return the warnings about the stream since its counters were ``before``."""
+        found: list[str] = []
+        counts = {name: count - before.get(name, 0) for name, count in self.counters.items()}
         if self.phase_missing:
             found.append(
                 f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
