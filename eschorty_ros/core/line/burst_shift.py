@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
+from eschorty_ros.core.line.line_history import RECENT_PROFILES
 from eschorty_ros.core.line.window import (
     _ONE,
     _ONE_BITS,
@@ -124,13 +125,24 @@ def _difference(bursts, block, polarity, explained_px):
 
 
 @kernel(_nrt=False)
-def _points_shifted(shift_px, points):
-    """Return how many of the ``points``, by block, have a shift."""
-    shifted = 0.0
-    for block in range(points.size):
-        if shift_px[block] > 0.0:
-            shifted += points[block]
-    return np.int64(shifted)
+def _points_followed(history):
+    """Return the points where the sums are of enough profiles, and how many have a shift."""
+    followed, shifted = 0.0, 0.0
+    for block in range(history.shift_px.size):
+        if history.recent.profiles[block] >= RECENT_PROFILES:
+            followed += history.now.points[block]
+            shifted += history.now.points[block] if history.shift_px[block] > 0.0 else 0.0
+    return np.int64(followed), np.int64(shifted)
+
+
+@kernel(_nrt=False)
+def _is_taken(columns, c, seed, half):
+    """Return whether the region of interest takes all rows of a column's window."""
+    if columns.row_first.size == 0:
+        return True
+    first = np.int64(columns.row_first[c])
+    last = first + np.int64(columns.row_span[c])
+    return (seed - half >= first * FRACTION) & (seed + half <= last * FRACTION)
 
 
 @kernel(_nrt=False)
@@ -154,6 +166,8 @@ def _compare_bursts(columns, half, profiles, blink, steps_px, common2, bursts, s
         if c >= columns.seeds.size or columns.seeds[c] < 0 or np.isnan(common2[c]):
             continue
         start, seed = columns.starts[c], columns.seeds[c]
+        if not _is_taken(columns, c, seed, half):
+            continue
         _add_column(columns.packed, start, seed, half, blink, block, bursts)
         explained_px = steps_px[block] + _EXPLAINED * np.sqrt(common2[c])
         on = _difference(bursts, block, 1, explained_px)

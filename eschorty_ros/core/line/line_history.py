@@ -30,7 +30,7 @@ SIGMA_COMMON_PX = 0.04
 # Larger differences from profile to profile are those of another surface.
 _JITTER_MAX_PX = 1.0
 # Profiles whose mean a profile is compared with.
-_PROFILES = 16.0
+RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
@@ -148,11 +148,11 @@ def _compare_polarities(columns, half, first, history):
         row, apart = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
         if np.isnan(row):
             continue
-        mean.all_columns[block] = min(mean.all_columns[block] + 1.0, _PROFILES)
+        mean.all_columns[block] = min(mean.all_columns[block] + 1.0, RECENT_PROFILES)
         mean.apart[block] += (apart - mean.apart[block]) / mean.all_columns[block]
         mean.apart2[block] += (apart * apart - mean.apart2[block]) / mean.all_columns[block]
         if history.step_px[block] > 0.0:
-            mean.columns[block] = min(mean.columns[block] + 1.0, _PROFILES)
+            mean.columns[block] = min(mean.columns[block] + 1.0, RECENT_PROFILES)
             mean.row[block] += (row - mean.row[block]) / mean.columns[block]
 
 
@@ -177,7 +177,7 @@ def _compare_with_recent(history, known, usual, width_variance):
         changed = max(least - width, width - most, 0.0) if known else 0.0
         width2 = width_variance / points
         passing2 = PER_WIDTH**2 * (changed * changed - width2)
-        profiles = min(profiles + 1.0, _PROFILES)
+        profiles = min(profiles + 1.0, RECENT_PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
         if profiles > 1.0:
@@ -200,7 +200,7 @@ def _compare_with_recent(history, known, usual, width_variance):
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         # What an edge that passes changes at once is no scatter, and counts little.
-        limit = _PROFILES / profiles * np.sqrt(width2) if known and profiles > 1.0 else np.inf
+        limit = RECENT_PROFILES / profiles * np.sqrt(width2) if known and profiles > 1.0 else np.inf
         recent.width[block] += weight * max(min(width - recent.width[block], limit), -limit)
         recent.profiles[block] = profiles
 

@@ -14,7 +14,7 @@ from eschorty_ros.core.line.burst_shift import (
     Bursts,
     _compare_bursts,
     _forget_bursts,
-    _points_shifted,
+    _points_followed,
     empty_bursts,
 )
 from eschorty_ros.core.line.centroid import (
@@ -114,6 +114,7 @@ COUNTERS = (
     "columns_unmodulated",
     "events_unmodulated",
     "points_burst_shift",
+    "points_followed",
     "footprints",
     "footprints_lopsided",
 )
@@ -360,7 +361,9 @@ def _close(memory):
         )  # fmt: skip
     state.profiles += 1
     _mark_unusual(rows, smoothing, memory.light.lit_share)
-    counters.points_burst_shift += _points_shifted(history.shift_px, history.now.points)
+    followed, shifted = _points_followed(history)
+    counters.points_followed += followed
+    counters.points_burst_shift += shifted
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
     if _choose(footprint, rows.row[0], history, late and enough, always):

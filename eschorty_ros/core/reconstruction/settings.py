@@ -169,7 +169,7 @@ class Settings:
         "of the stream's rows scales the result",
     )  # fmt: skip
     sigma_floor_px: float = _number(
-        SIGMA_FLOOR_PX, 0.0, 10.0, "px",
+        SIGMA_FLOOR_PX, 0.01, 10.0, "px",
         "part of a row's standard deviation that more events do not reduce; scaled as with "
         "sigma_factor",
     )  # fmt: skip

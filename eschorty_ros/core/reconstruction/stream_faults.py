@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-# Chance gives half of the points of a few profiles a shift, up to 0.18 of those of short streams.
+# Chance gives up to 0.18 of the points of short streams a shift.
 _BURST_SHIFT_SHARE = 0.22
 _RATE_CONTROL_SHARE = 0.01
 # Words that a stream which begins anywhere, or goes on after a gap, may break.
@@ -51,7 +51,7 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         found.append(
             f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
         )
-    share = counts["points_burst_shift"] / max(counts["points"], 1)
+    share = counts["points_burst_shift"] / max(counts["points_followed"], 1)
     if share > _BURST_SHIFT_SHARE:
         found.append(
             f"early and late events of a burst have different rows in {share:.0%} of the "

@@ -79,6 +79,14 @@ def test_a_light_of_the_other_polarity_has_its_reason_alone(tmp_path):
     assert "check its frequency, duty cycle and polarity" in line
 
 
+def test_lines_that_the_limits_of_the_range_cut_are_no_fault_of_the_camera(tmp_path):
+    """The region of interest ends a line's width behind the limit."""
+    build = replace(NARROW, columns=480, principal_column=239.5)
+    recording = simulate_recording(tmp_path, named("steps"), build, stop_mm=30.0)
+    result = reconstruct_recording(recording, Settings(range_max=1.3))
+    assert (result.warnings, len(result.points) > 0) == ((), True)
+
+
 @pytest.mark.parametrize("scene", ["plane", "posts"])
 def test_a_good_recording_has_no_warning(recording, tmp_path, scene):
     if scene == "posts":
