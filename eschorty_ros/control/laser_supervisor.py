@@ -65,6 +65,7 @@ class LaserSupervisor:
         self._in_flight = CommandsInFlight()
         self._laser: LaserModulator | None = None
         self._record = LaserRecord()
+        self._tripped = False
         self._watchdogs: list[_Watchdog] = []
         self._stalls: StallMeter
         self.switch_offs = 0
@@ -85,6 +86,7 @@ class LaserSupervisor:
         with self._locked():
             self._laser, self._record.modulation = laser, modulation
             self._record.requested, self._record.reason = LaserOutput.OFF, "off at start"
+            self._tripped = False
             self.interlock.note_disabled()
         laser.disable()
         laser.configure(modulation)
@@ -143,7 +145,7 @@ class LaserSupervisor:
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 self.interlock.arm()
-                self._record.reason = "armed"
+                self._record.reason, self._tripped = "armed", False
 
     def enable(self) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
@@ -175,7 +177,14 @@ class LaserSupervisor:
                 self._receive(readback)
 
     def disable(self, reason: str) -> None:
-        """Disable before anything else; raises ``DeviceError`` when it is not confirmed."""
+        """Disable before anything else; raises ``DeviceError`` when it is not confirmed.
+
+        A trip stays the reason why the output is off until the laser is armed again.
+        """
+        self._disable(reason, self._record.reason if self._tripped else reason)
+
+    def _disable(self, reason: str, stated: str) -> None:
+        """Disable for a reason; the record has the ``stated`` one."""
         with self._in_flight.disabling(reason), self._locked():
             laser = self._laser
             if laser is None:
@@ -187,7 +196,7 @@ class LaserSupervisor:
                 fault = error
             self.switch_offs += self._record.requested is LaserOutput.ON
             self.interlock.note_disabled()
-            self._record.requested, self._record.reason = LaserOutput.OFF, reason
+            self._record.requested, self._record.reason = LaserOutput.OFF, stated
             if fault is not None:
                 self._record.lose(fault)
                 self.report()
@@ -202,8 +211,9 @@ class LaserSupervisor:
 
     def trip(self, reason: str) -> bool:
         """Disable for a reason that nothing requested; alarms when it is not confirmed."""
+        self._tripped = True
         try:
-            self.disable(reason)
+            self._disable(reason, reason)
         except EschortyError as error:
             self._call(self._alarm, str(error))
             return False

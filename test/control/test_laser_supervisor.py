@@ -97,6 +97,22 @@ def test_light_that_ends_by_itself_is_reported_with_why_it_is_off(laser):
     assert "reads back OFF, requested ON" in seen[-1].reason
 
 
+def test_a_trip_stays_the_reason_until_it_is_armed_again(laser):
+    seen: list[LaserStatus] = []
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, seen.append)
+    for request in (supervisor.arm, supervisor.enable):
+        request()
+    supervisor.trip("interlock open (door); close it")
+    # As the scanner does on its way out.
+    supervisor.disable("switched off by request")
+    assert seen[-1].reason == "interlock open (door); close it"
+    supervisor.arm()
+    supervisor.disable("switched off by request")
+    assert seen[-1].reason == "switched off by request"
+    supervisor.close()
+
+
 def test_arming_does_not_outlive_disabling(supervisor, laser):
     laser.delayed = "arm"
     failures: list[str] = []
