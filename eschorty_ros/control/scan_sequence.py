@@ -215,6 +215,14 @@ def check_request(request: ScanRequest, limits: ScanLimits, unit: str = "m") -> 
     if not 1 <= request.passes <= PASSES_MAX:
         raise ArgumentError(f"passes is {request.passes}; choose 1 to {PASSES_MAX}")
     check_laser(request.frequency_hz, request.duty)
+    length_mm = abs(request.stop_mm - request.start_mm)
+    if request.frequency_hz and length_mm < request.speed_mm_s / request.frequency_hz:
+        raise ArgumentError(
+            f"start to stop is {length_mm * scale:.4g} {unit}, less than the way of one period, "
+            f"{request.speed_mm_s / request.frequency_hz * scale:.4g} {unit} at "
+            f"{request.speed_mm_s * scale:g} {unit}/s and {request.frequency_hz:g} Hz; choose a "
+            "longer sweep or a lower speed"
+        )
 
 
 def check_laser(frequency_hz: float, duty: float) -> None:

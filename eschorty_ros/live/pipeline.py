@@ -53,8 +53,13 @@ class ScanReport:
 
     @property
     def completeness(self) -> float:
-        """Return the least share of what there should be: of profiles, packets and points."""
+        """Return the least share of what there should be: of profiles, packets and points.
+
+        It is 0 without points.
+        """
         points = len(self.scan.points)
+        if not points:
+            return 0.0
         lost = self.points_without_stage + self.points_over_limit
         return min(
             _share(self.scan.profiles, self.profiles_expected),
@@ -86,6 +91,8 @@ class ScanReport:
     def _cause_of_empty(self) -> str:
         if not (self.events and self.points_outside):
             return f"no points: {without_modulation(self.events, self.frequency_hz)}"
+        if not self.profiles_expected:
+            return "no points: the stage has not moved by a profile between start and stop"
         return (
             f"no points: all {self.points_outside} are outside start to stop; check that the "
             "stamps of camera and stage are of the same clock"

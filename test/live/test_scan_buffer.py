@@ -71,28 +71,25 @@ def test_points_outside_the_limits_are_counted():
 
 
 @pytest.mark.parametrize(
-    ("points", "events", "without", "outside", "begins"),
+    ("points", "events", "without", "outside", "expected", "begins"),
     [
-        (5, 100, 0, 3, ""),
-        (0, 0, 0, 0, "no points: no events came"),
-        (
-            0,
-            100,
-            0,
-            0,
-            "no points: hardly any of 100 events follow the laser's modulation at 70 Hz",
-        ),
-        (0, 100, 0, 3, "no points: all 3 are outside start to stop"),
-        (0, 100, 7, 3, "7 points had no stage position"),
+        (5, 100, 0, 3, 1, ""),
+        (0, 0, 0, 0, 1, "no points: no events came"),
+        (0, 100, 0, 0, 1, "no points: hardly any of 100 events follow the laser's modulation at"),
+        (0, 100, 0, 3, 1, "no points: all 3 are outside start to stop"),
+        (0, 100, 0, 3, 0, "no points: the stage has not moved by a profile between"),
+        (0, 100, 7, 3, 1, "7 points had no stage position"),
     ],
 )
-def test_a_scan_without_points_has_the_reason(points, events, without, outside, begins):
+def test_a_scan_without_points_has_the_reason(points, events, without, outside, expected, begins):
     buffer = ScanBuffer("a", 0.0, 1.0)
     if points:
         buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
-    report = ScanReport(buffer.assemble(), events, 1, 0, 0, without, outside, 0, 0, 70.0)
+    counts = events, 1, 0, 0, without, outside, 0, expected
+    report = ScanReport(buffer.assemble(), *counts, 70.0)
     assert report.message.startswith(begins)
     assert bool(report.message) == bool(begins)
+    assert (report.completeness > 0.0) == bool(points)
 
 
 def test_points_of_before_the_scan_are_left_out_and_counted():
