@@ -174,6 +174,14 @@ class LaserTimeline:
         gate = self._gates.at(t_us)
         return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
 
+    def ends_period(self, t_us: int) -> bool:
+        """Return true when the lit part of a period, or the period, is complete at ``t_us``."""
+        gate = self._gates.at(t_us - 1)
+        if gate is None:
+            return False
+        index = gate.index(t_us - 1)
+        return t_us in (gate.fall_us(index), gate.rise_us(index + 1))
+
     def edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
         """Return the edges of the gate's signal from ``begin_us`` to before ``end_us``.
 

@@ -265,9 +265,10 @@ class World:
         self._line.draw(t_us, position_mm + velocity_mm_s * 0.5e-6 * (end_us - t_us), level)
 
     def _remove(self, t_us: int) -> None:
-        """Remove the line and log the phase that ends here."""
+        """Remove the line and log the phase that ends here, unless switching off has cut it."""
         self._line.remove(t_us)
-        self._close_phase(t_us)
+        if self._laser.ends_period(t_us):
+            self._close_phase(t_us)
         self._lit_since_us = None
         self._step_us = None
 

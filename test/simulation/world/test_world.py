@@ -169,6 +169,17 @@ def test_truth_is_the_scene_at_the_middle_of_each_lit_phase() -> None:
     assert set(x.tolist()) <= set(truth["column"].tolist())
 
 
+def test_a_lit_phase_that_switching_off_cuts_is_no_period_of_the_truth() -> None:
+    world = World(Plane(1300.0), SMALL, seed=SEED, background_hz=0.0)
+    world.set_laser(0, True, Modulation(70.0, 0.5, "square", 1000))
+    # 3 ms after the fifth rising edge.
+    world.set_laser(1000 + 4 * 14_286 + 3000, False)
+    world.advance(200_000)
+    ends_us = np.unique(world.truth["t_us"]) + 3571
+    assert ends_us[-1] < 1000 + 4 * 14_286
+    assert ends_us.size >= 4
+
+
 def test_a_line_beyond_the_sensor_is_neither_seen_nor_true() -> None:
     world = World(Plane(3000.0), SMALL, seed=SEED, background_hz=0.0)
     world.set_laser(0, True, WAVE)
