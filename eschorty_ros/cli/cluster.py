@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -27,6 +28,8 @@ def on_cluster(
             "--dask needs dask.distributed; install it by `pip install distributed`"
         ) from error
     try:
+        # A client that finds no scheduler would wait for it once more when it is deleted.
+        asyncio.run(_reach(address))
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DeviceError(
@@ -40,3 +43,10 @@ def on_cluster(
         for done in as_completed(index, loop=client.loop):
             failure = done.exception()
             yield index[done], done.result() if failure is None else failure
+
+
+async def _reach(address: str) -> None:
+    from distributed.comm import connect
+
+    comm = await connect(address, timeout=_CONNECT_S)
+    await comm.close()

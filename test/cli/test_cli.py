@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gc
 import io
 import json
 import os
@@ -19,8 +20,9 @@ from numba.core.event import install_recorder
 from waiting import wait_until
 
 from eschorty_ros import __version__
-from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
+from eschorty_ros.cli import COMMANDS, INTERRUPTED, cluster, main
 from eschorty_ros.cli.console import progress_bar, table
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
 
@@ -483,3 +485,13 @@ def test_a_narrow_terminal_cuts_no_number():
     console.print(made)
     text = console.file.getvalue()
     assert ("…" in text, text.count("-1320.017")) == (False, 5)
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nowhere.invalid", "tcp://:x"])
+def test_a_scheduler_that_does_not_answer_is_one_line(address, monkeypatch):
+    pytest.importorskip("distributed", reason="distributed is not installed")
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.3)
+    with pytest.raises(DeviceError, match="no dask scheduler answers"):
+        next(cluster.on_cluster(address, print, [()]))
+    # A client that is left would warn here.
+    gc.collect()
