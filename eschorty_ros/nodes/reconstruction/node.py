@@ -36,7 +36,11 @@ from eschorty_ros.nodes.reconstruction.calibrator import Calibrator
 from eschorty_ros.nodes.reconstruction.camera_roi import CameraRoi
 from eschorty_ros.nodes.reconstruction.inputs import packet_from_message
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
-from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_override
+from eschorty_ros.nodes.reconstruction.parameters import (
+    TABLE,
+    check_record_name,
+    modulation_override,
+)
 from eschorty_ros.nodes.reconstruction.reports import Reports
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
@@ -85,6 +89,7 @@ class ReconstructionNode(Node):
             slow.cancel()
         self._override = modulation_override(self.parameters)
         self._record_named = ""
+        check_record_name(self.parameters["record_name"])
         self._pipeline = Pipeline(
             self.calibration,
             self.parameters.settings(Settings),
@@ -209,6 +214,7 @@ class ReconstructionNode(Node):
 
     def _on_laser(self, message: LaserState, info: Mapping[str, Any]) -> None:
         self._laser.check(info)
+        self._pipeline.stream.laser_hz = float(message.frequency)
         if self._override is None:
             self._post(partial(self._pipeline.stream.set_laser, *laser_settings(message)))
 
@@ -328,6 +334,7 @@ class ReconstructionNode(Node):
         self._scans.finish()
 
     def _on_change(self, values: dict[str, Any]) -> None:
+        check_record_name(values["record_name"])
         names = Settings.__dataclass_fields__
         settings = Settings(**{name: values[name] for name in names if name in values})
         override = modulation_override(values)
