@@ -114,9 +114,12 @@ def command(
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near
-    _print(build, np.linspace(near, last, ranges))
+    light = ""
     if power_mw is not None:
-        _print_light(build, near, min(far, last), power_mw, wavelength_nm)
+        light = _light(build, near, min(far, last), power_mw, wavelength_nm)
+    _print(build, np.linspace(near, last, ranges))
+    if light:
+        click.echo(light)
     for out in outs:
         if out.suffix in (".yaml", ".yml"):
             save_calibration(build.calibration(out.stem), out)
@@ -125,22 +128,21 @@ def command(
         click.echo(str(out))
 
 
-def _print_light(
+def _light(
     build: Design, near_mm: float, far_mm: float, power_mw: float, wavelength_nm: float
-) -> None:
+) -> str:
+    """Return the photons of the line per column and the laser's class, in two lines."""
     from eschorty_ros.core.optics import laser_class, photons_per_column
 
     photons = [
         photons_per_column(build, range_mm, power_mw, wavelength_nm, _LIGHT_S)
         for range_mm in (near_mm, far_mm)
     ]
-    click.echo(
-        f"{power_mw:g} mW at {wavelength_nm:g} nm: {photons[0]:.2g} to {photons[1]:.2g} photons "
-        f"per column in {_LIGHT_S * 1e3:.1f} ms from white, nearest to farthest"
-    )
     found = laser_class(power_mw, wavelength_nm, build.field_deg)
     limits = ", ".join(f"{name}: {limit:.3g}" for name, limit in found.limits_mw.items())
-    click.echo(
+    return (
+        f"{power_mw:g} mW at {wavelength_nm:g} nm: {photons[0]:.2g} to {photons[1]:.2g} photons "
+        f"per column in {_LIGHT_S * 1e3:.1f} ms from white, nearest to farthest\n"
         f"class {found.name} by estimate, not a safety statement: {found.accessible_mw:.3g} mW "
         f"through 7 mm at 100 mm (limits in mW {limits}; IEC 60825-1)"
     )
