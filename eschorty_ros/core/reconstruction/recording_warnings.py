@@ -21,8 +21,9 @@ _TURNS_ENOUGH = 20
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
 _FEW = 10
-# Longest way of a stage in metres, and what the readings of one at rest differ by.
-_METRES_MAX = 0.3
+# Longest way of a stage and largest position in metres, and what the readings of one at rest differ
+# by.
+_METRES_MAX, _METRES_FAR = 0.3, 1.0
 _REST_MM = 0.003
 # Part of the stage's way and time that may be after the last event: camera and stage do not end at
 # once.
@@ -123,7 +124,7 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
     t_us, position_mm = (recording.stage_samples[name] for name in ("t_us", "position_mm"))
     found, name = [], recording.events_path.name
     way_mm = float(np.ptp(position_mm))
-    if _REST_MM < way_mm <= _METRES_MAX:
+    if _REST_MM < way_mm <= _METRES_MAX and np.abs(position_mm).max() < _METRES_FAR:
         found.append(
             f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
         )

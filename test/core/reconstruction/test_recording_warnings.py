@@ -87,6 +87,13 @@ def test_lines_that_the_limits_of_the_range_cut_are_no_fault_of_the_camera(tmp_p
     assert (result.warnings, len(result.points) > 0) == ((), True)
 
 
+def test_a_short_sweep_far_from_zero_is_not_in_metres(tmp_path):
+    recording = simulate_recording(
+        tmp_path, Plane(1300.0), NARROW, start_mm=10.0, stop_mm=10.1, speed_mm_s=1.0
+    )
+    assert reconstruct_recording(recording).warnings == ()
+
+
 @pytest.mark.parametrize("scene", ["plane", "posts"])
 def test_a_good_recording_has_no_warning(recording, tmp_path, scene):
     if scene == "posts":
