@@ -41,7 +41,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """True when the value is within its band; NaN never is."""
+        """Return whether the value is within its band; NaN never is."""
         return self.low <= self.value <= self.high
 
 

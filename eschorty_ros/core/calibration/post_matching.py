@@ -59,7 +59,7 @@ class KnownTarget:
 
     @property
     def hinted(self) -> bool:
-        """True when the column or row where it is expected is known."""
+        """Return whether the column or row where it is expected is known."""
         return not (math.isnan(self.column) and math.isnan(self.row))
 
 

@@ -40,12 +40,12 @@ class SensorClock:
 
     @property
     def exact(self) -> bool:
-        """True when the zero was announced."""
+        """Return whether the zero was announced."""
         return self._fixed is not None
 
     @property
     def from_edges(self) -> bool:
-        """True when the relation comes from trigger edges."""
+        """Return whether the relation comes from trigger edges."""
         return self._adopted is not None
 
     @property
@@ -74,7 +74,7 @@ class SensorClock:
         return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
 
     def goes_on(self, t_us: int, arrival_ns: int) -> bool:
-        """Return true when neither time is before the last observed."""
+        """Return whether neither time is before the last observed."""
         t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])

@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def ctz64(typingctx: Any, value: Any) -> Any:
-    """Index of the lowest set bit of a uint64; undefined for 0."""
+    """Return the index of the lowest set bit of a uint64; undefined for 0."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))

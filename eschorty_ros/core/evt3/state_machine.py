@@ -246,7 +246,7 @@ def _emit(sink, n, t_us, column, row, polarity):
 
 @kernel
 def _is_late(mask, bits, s):
-    """Return true when a vector's first event on the sensor is too late to decode."""
+    """Return whether a vector's first event on the sensor is too late to decode."""
     if s.late == _IN_TIME or s.base >= s.limit:
         return False
     shown = min(s.limit - s.base, np.int64(bits))

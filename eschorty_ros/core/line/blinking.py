@@ -143,7 +143,7 @@ def _vector(column, first, last, blink):
 
 @kernel
 def _is_in_phase(sums, blink):
-    """Return true when 9 of 10 events of a window are between their edge and the other one.
+    """Return whether 9 of 10 events of a window are between their edge and the other one.
 
     Only from 16 events on, which background reaches less often than a vector strength of a half,
     and where a profile has one period.
@@ -162,14 +162,14 @@ def _cosine(vector, blink):
 
 @kernel(_nrt=False)
 def _is_alike(vector, blink):
-    """Return true when a phase is near that which the stream's lines have in common, if any."""
+    """Return whether a phase is near that which the stream's lines have in common, if any."""
     number, near = blink.lines[2], blink.lines[3]
     return number < _LINES_MIN or 2.0 * near < number or _cosine(vector, blink) > _ALIKE
 
 
 @kernel(_nrt=False)
 def _is_of_the_stream(column, window, blink):
-    """Return true when a window's events are in phase, with the laser and with other lines."""
+    """Return whether a window's events are in phase, with the laser and with other lines."""
     if not _is_in_phase(window.sums, blink):
         return False
     return _is_alike(_vector(column, window.first, window.last, blink), blink)
@@ -203,7 +203,7 @@ def _add_lines(columns, half, place, blink):
 
 @kernel(_nrt=True)
 def _has_bursts(column, first, last, blink):
-    """Return true when many ON events are close behind a rising edge and OFF ones a falling one.
+    """Return whether many ON events are close behind a rising edge and OFF ones a falling one.
 
     Chernoff's bound limits the probability that background has them.
     """

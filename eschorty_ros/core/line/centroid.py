@@ -142,7 +142,7 @@ def _cut_bias2(row, variance, line_variance, sensor_rows):
 
 @kernel
 def _learns(footprint):
-    """Return true when the line's footprint is learned from the profile."""
+    """Return whether the line's footprint is learned from the profile."""
     return footprint.state.near_edge > 0 or footprint.state.choice != MEAN_ROWS
 
 

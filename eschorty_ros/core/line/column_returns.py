@@ -163,19 +163,19 @@ def _reported(returns, found):
 
 @kernel
 def _is_cut(window, sensor_rows):
-    """Return true when a window reaches the first or last row of the sensor."""
+    """Return whether a window reaches the first or last row of the sensor."""
     return window.first == 0 or window.last >= sensor_rows - 1.0
 
 
 @kernel
 def _is_alone(used, events):
-    """Return true when a window has so many of the events that no other is nearly as strong."""
+    """Return whether a window has so many of the events that no other is nearly as strong."""
     return 3 * used > 2 * events
 
 
 @kernel
 def _is_clear(window, column, estimator, blink):
-    """Return true when a window needs no search for others and no further test of its events."""
+    """Return whether a window needs no search for others and no further test of its events."""
     events = window.sums.events
     return (
         events >= estimator.events_min
@@ -188,7 +188,7 @@ def _is_clear(window, column, estimator, blink):
 
 @kernel(_nrt=False)
 def _goes_on(window, found, columns, c, half, estimator):
-    """Return true when a column's line is where it was, as strong, and another one is new there.
+    """Return whether a column's line is where it was, as strong, and another one is new there.
 
     A lamp or an edge that passes can have a burst in phase with the laser, but not in two profiles
     at the same rows. What is new and stays is a rival in the next profile.

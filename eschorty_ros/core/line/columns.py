@@ -136,7 +136,7 @@ def _late(bins, polarity):
 
 @kernel(_nrt=False)
 def _is_selected(bins, c, r, late):
-    """Return true when region and gate take an event, or count why not."""
+    """Return whether region and gate take an event, or count why not."""
     if bins.row_first.size > 0 and np.uint32(r - bins.row_first[c]) > bins.row_span[c]:
         bins.refused.outside_region += 1
         return False
@@ -185,7 +185,7 @@ _bin_all = with_names(_append_event, "all", _late=_never_late, _is_selected=_sel
 
 @kernel(_nrt=False)
 def _needs_room(columns):
-    """Return true when events found no room in columns that may grow."""
+    """Return whether events found no room in columns that may grow."""
     return columns.refused.over_limit > 0 and columns.room < columns.limit
 
 

@@ -104,7 +104,7 @@ def _centre(pixels):
 
 @kernel
 def _is_lopsided(pixels):
-    """Return true when the mean of the counts by place is not in the middle of their ends."""
+    """Return whether the mean of the counts by place is not in the middle of their ends."""
     mean = _mean_counts(pixels)[1]
     low = high = np.argmax(mean)
     least = _END_SHARE * mean[low]

@@ -138,7 +138,7 @@ def _fill_rows(columns, half, gate, row):
 
 @kernel
 def _move_together(row, others):
-    """Return true when the differences of rows of near columns are alike."""
+    """Return whether the differences of rows of near columns are alike."""
     ratios, blocks = 0.0, 0
     for first in range(0, row.size, _TOGETHER):
         difference = row[first : first + _TOGETHER] - others[first : first + _TOGETHER]

@@ -207,7 +207,7 @@ def _compare_with_recent(history, known, usual, width_variance):
 
 @kernel(_nrt=False)
 def _moves_fast(history):
-    """Return true when most blocks with points move by more than half a row per profile."""
+    """Return whether most blocks with points move by more than half a row per profile."""
     blocks, fast = 0, 0
     for block in range(1, history.step_px.size - 1):
         if history.now.points[block] > 0.0:

@@ -313,7 +313,7 @@ def _densest_window(column, half):
 
 @kernel
 def _exceeds_background(events, others, half, rows_taken):
-    """Return true when a window has more ``events`` than background of the others' density.
+    """Return whether a window has more ``events`` than background of the others' density.
 
     The background is uniform; the excess has to exceed 4 standard deviations.
     """
@@ -333,7 +333,7 @@ def _chernoff_exponent(events, expected):
 
 @kernel
 def _is_significant(events, others, half, rows_taken):
-    """Return true when background has ``events`` in any window of a column with low probability.
+    """Return whether background has ``events`` in any window of a column with low probability.
 
     The probability is Chernoff's bound on the Poisson tail, times the number of windows that the
     search chooses from. Its density is that of the ``others`` events outside the two windows and

@@ -102,7 +102,7 @@ class EdgeSchedule:
 
     @property
     def triggered(self) -> bool:
-        """True when triggers set the edges."""
+        """Return whether triggers set the edges."""
         return self._state.triggered
 
     @property

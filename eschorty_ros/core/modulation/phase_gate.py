@@ -72,7 +72,7 @@ def _is_outside(phase, begin, span):
 
 @kernel(_nrt=False)
 def _is_late(dt_us, polarity, gate):
-    """Return true when an event ``dt_us`` after a rising edge is outside the gate."""
+    """Return whether an event ``dt_us`` after a rising edge is outside the gate."""
     if gate.step == 0:
         return False
     phase = np.uint32(np.uint32(dt_us) * np.uint32(gate.step))

@@ -218,7 +218,7 @@ def _row_variance(counts: NDArray[Any], sums: Array, periods: int) -> float:
 
 
 def _is_line(columns: NDArray[np.uint16], rows: NDArray[np.uint16]) -> bool:
-    """Return true when the events of near columns are in few rows."""
+    """Return whether the events of near columns are in few rows."""
     column, row = columns >> _CELL_BITS, rows >> _CELL_BITS
     cells = np.bincount(column.astype(np.int64) << _CELL_BITS * 2 | row)
     return _distinct(cells) < _LINE_CELLS_MAX * _distinct(np.bincount(column))

@@ -334,7 +334,7 @@ class Reconstructor:
 
     @property
     def phase_missing(self) -> bool:
-        """True when a flush found no phase in the events held back, and used none."""
+        """Return whether a flush found no phase in the events held back, and used none."""
         return self._periods.lock.missing
 
     @property
@@ -344,7 +344,7 @@ class Reconstructor:
 
     @property
     def warnings(self) -> list[str]:
-        """One line for each fault of the stream, and for each reason of points that miss."""
+        """Return one line for each fault of the stream, and for each reason of points that miss."""
         return self.warnings_since({})
 
     def warnings_since(self, before: Mapping[str, int]) -> list[str]:

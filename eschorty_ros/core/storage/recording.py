@@ -89,7 +89,7 @@ class ScanLog(Schema):
 
     @property
     def faults(self) -> list[str]:
-        """One line for each thing that the recording lacks."""
+        """Return one line for each thing that the recording lacks."""
         found = []
         if self.state == "recording":
             found.append("the recording was not ended: its process was killed or still writes")

@@ -184,7 +184,7 @@ class AptStage:
 
     @property
     def healthy(self) -> bool:
-        """True while status messages come and nothing has failed."""
+        """Return whether status messages come and nothing has failed."""
         return self._tracker.failure is None and not self._closed and not self._tracker.late
 
     def statistics(self) -> dict[str, float]:

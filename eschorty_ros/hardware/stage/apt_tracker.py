@@ -108,14 +108,14 @@ class Tracker:
 
     @property
     def late(self) -> bool:
-        """True when status messages do not come although this process runs."""
+        """Return whether status messages do not come although this process runs."""
         age_ns = self.age_ns
         checked = self._age_checks >= _LATE_CHECKS_MIN or age_ns > FAULT_AGE_NS
         return age_ns > WARN_AGE_NS and checked
 
     @property
     def homing(self) -> bool:
-        """True while the axis moves to its reference."""
+        """Return whether the axis moves to its reference."""
         return self.motion is not None and self.motion.kind is Kind.HOME
 
     def has(self, bits: int) -> bool:

@@ -70,7 +70,7 @@ class Gate:
         return index
 
     def high(self, t_us: int) -> bool:
-        """Return true when the gate's signal is high at ``t_us``: from rising to falling edge."""
+        """Return whether the gate's signal is high at ``t_us``: from rising to falling edge."""
         return self._flank(t_us)[2]
 
     def flank_us(self, t_us: int) -> int:
@@ -170,12 +170,12 @@ class LaserTimeline:
         return 0.0 if gate is None else gate.level(t_us)
 
     def rises(self, t_us: int) -> bool:
-        """Return true when ``t_us`` is a rising edge."""
+        """Return whether ``t_us`` is a rising edge."""
         gate = self._gates.at(t_us)
         return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
 
     def ends_period(self, t_us: int) -> bool:
-        """Return true when the lit part of a period, or the period, is complete at ``t_us``."""
+        """Return whether the lit part of a period, or the period, is complete at ``t_us``."""
         gate = self._gates.at(t_us - 1)
         if gate is None:
             return False
