@@ -104,6 +104,7 @@ class PacketStream:
         self._retired: Counter[str] = Counter()
         self._counts_before: dict[str, int] = {}
         self._last_warnings: list[str] | None = None
+        self._changed_while_on = False
         self._out: list[TimedProfiles] = []
 
     @property
@@ -177,10 +178,13 @@ class PacketStream:
                 f"frequency is {self.frequency_hz:g} Hz and the laser reports {self.laser_hz:g} "
                 "Hz; correct it, or set it to 0"
             )
+        if self._changed_while_on:
+            lines.append("the laser's modulation was changed while it was on")
         return [*lines, *reconstructor.warnings_since(self._counts_before)]
 
     def _restart_warnings(self) -> None:
         self._last_warnings, reconstructor = None, self._reconstructor
+        self._changed_while_on = False
         self._counts_before = {} if reconstructor is None else reconstructor.counters
 
     def announce_zero(self, zero_ns: int) -> None:
@@ -226,6 +230,8 @@ class PacketStream:
             self._last_warnings = self.warnings
         self._on_since_ns = on_since_ns
         changed = (modulation, epoch_ns) != self._laser
+        other = self._laser is not None and modulation != self._laser[0]
+        self._changed_while_on |= other and on_since_ns is not None
         self._laser = modulation, epoch_ns
         if self._reconstructor is not None and changed:
             if self._reconstructor.settings != self._settings.allowed(modulation):

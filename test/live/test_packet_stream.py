@@ -554,3 +554,18 @@ def test_a_frequency_other_than_the_lasers_has_a_warning():
     assert not [text for text in made.warnings if "the laser reports" in text]
     made.laser_hz = 70.0
     assert "frequency is 140 Hz and the laser reports 70 Hz" in made.warnings[0]
+
+
+def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning():
+    made = stream()
+    made.announce_zero(ZERO_NS)
+    epoch_ns = ZERO_NS + EDGE_US * 1000
+    made.set_laser(Modulation(90.0), epoch_ns)
+    made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS)
+    push(made, packets(line()))
+    assert not [text for text in made.warnings if "changed" in text]
+    made.set_laser(Modulation(90.0), epoch_ns, on_since_ns=ZERO_NS)
+    assert "the laser's modulation was changed while it was on" in made.warnings
+    made.set_laser(MODULATION, epoch_ns, None)
+    made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS + 1)
+    assert not [text for text in made.warnings if "changed" in text]
