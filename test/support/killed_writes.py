@@ -25,7 +25,7 @@ from eschorty_ros.report import calibration_page, figures
 STEPS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree"}
 TOP = ("rec", "new", "scanned", "calibration", ".")
 FULL_AT = (0, 1, 100, 1000, 5000, 20_000, 100_000)
-SWEEP = ("--scene", "plane", "--start", 10, "--stop", 11, "--speed", 200)
+SWEEP = ("--scene", "plane", "--start", 10, "--stop", 11, "--speed", 50)
 TARGETS = "row,range_mm\n50,820\n100,860\n300,1064\n500,1395\n600,1620\n"
 COMMANDS = {
     "simulate": ("simulate", *SWEEP, "--calibration", "small.yaml", "--out", "new"),
