@@ -47,6 +47,8 @@ def on_cluster(
 
 async def _reach(address: str) -> None:
     from distributed.comm import connect
+    from distributed.security import Security
 
-    comm = await connect(address, timeout=_CONNECT_S)
+    arguments = Security().get_connection_args("client")
+    comm = await connect(address, timeout=_CONNECT_S, **arguments)
     await comm.close()

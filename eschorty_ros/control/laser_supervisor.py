@@ -65,7 +65,7 @@ class LaserSupervisor:
         self._in_flight = CommandsInFlight()
         self._laser: LaserModulator | None = None
         self._record = LaserRecord()
-        self._tripped = False
+        self._trip_reason = ""
         self._watchdogs: list[_Watchdog] = []
         self._stalls: StallMeter
         self.switch_offs = 0
@@ -86,7 +86,7 @@ class LaserSupervisor:
         with self._locked():
             self._laser, self._record.modulation = laser, modulation
             self._record.requested, self._record.reason = LaserOutput.OFF, "off at start"
-            self._tripped = False
+            self._trip_reason = ""
             self.interlock.note_disabled()
         laser.disable()
         laser.configure(modulation)
@@ -145,7 +145,7 @@ class LaserSupervisor:
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 self.interlock.arm()
-                self._record.reason, self._tripped = "armed", False
+                self._record.reason, self._trip_reason = "armed", ""
 
     def enable(self) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
@@ -181,7 +181,7 @@ class LaserSupervisor:
 
         A trip stays the reason why the output is off until the laser is armed again.
         """
-        self._disable(reason, self._record.reason if self._tripped else reason)
+        self._disable(reason, self._trip_reason or reason)
 
     def _disable(self, reason: str, stated: str) -> None:
         """Disable for a reason; the record has the ``stated`` one."""
@@ -211,7 +211,7 @@ class LaserSupervisor:
 
     def trip(self, reason: str) -> bool:
         """Disable for a reason that nothing requested; alarms when it is not confirmed."""
-        self._tripped = True
+        self._trip_reason = reason
         try:
             self._disable(reason, reason)
         except EschortyError as error:
