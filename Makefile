@@ -23,7 +23,7 @@ SHELL := /bin/bash
 ifeq ($(MAKELEVEL)$(filter -j%,$(MAKEFLAGS)),0)
 MAKEFLAGS += --jobs=3
 endif
-ifneq ($(filter test,$(MAKECMDGOALS)),)
+ifeq ($(filter test,$(MAKECMDGOALS))$(TEST),test)
 MAKEFLAGS += --output-sync=line
 endif
 # Containers often set it; every process would compile numba and all the rest again, for a second.
