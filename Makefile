@@ -192,7 +192,7 @@ build-package:
 
 # numba compiles again what has changed since, when it is used. No ROS: it goes beside the interfaces with --jobs.
 $(BUILD)/kernels.stamp: $(BUILD)/run.stamp
-	@echo "Compiling kernels, for a minute or two"
+	@echo "Compiling kernels, for some minutes"
 	@NUMBA_CACHE_DIR="$(BUILD)/numba" $(VENV)/bin/python -c 'from eschorty_ros.cli import main; main(["compile"])'
 	@touch $@
 

@@ -14,7 +14,7 @@ def command() -> None:
     """Compile the numerical kernels, so that the first run is as fast as later ones.
 
     They are kept in numba's cache: beside the package, or in NUMBA_CACHE_DIR. Without this command
-    the first run compiles what it needs, for a minute or two.
+    the first run compiles what it needs, for some minutes.
 
     \b
     Example:

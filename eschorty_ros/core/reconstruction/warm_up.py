@@ -19,7 +19,7 @@ from eschorty_ros.core.reconstruction.settings import Settings
 def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     """Run a few events through a separate reconstruction.
 
-    The first run on a machine compiles for a minute or two; later runs load numba's cache. A node
+    The first run on a machine compiles for some minutes; later runs load numba's cache. A node
     does this before it accepts data, which would pile up meanwhile; a command before it measures
     the time.
 

@@ -63,7 +63,7 @@ _JOBS_PER_STEP = 32
 _STEP_S = 0.004
 # Loading the compiled kernels takes less.
 _COMPILING_S = 5.0
-_COMPILING = "compiling kernels, for a minute or two at a first start; 'eschorty compile' does it"
+_COMPILING = "compiling kernels, for some minutes at a first start; 'eschorty compile' does it"
 
 
 class ReconstructionNode(Node):
