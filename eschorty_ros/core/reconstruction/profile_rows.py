@@ -227,10 +227,7 @@ def first_choice(settings: Settings) -> int:
 
 def _factor_max(settings: Settings) -> float:
     """Return the largest factor of a variance by the scatter of rows."""
-    if settings.centroid in FULL_COLUMN_METHODS:
-        return 0.0
-    # The scatter that the compensation of reflectance steps removes does not widen sigma.
-    return 1.0 if settings.reflectance_compensation == "on" else FACTOR_MAX
+    return 0.0 if settings.centroid in FULL_COLUMN_METHODS else FACTOR_MAX
 
 
 @kernel(_nrt=True)

@@ -434,6 +434,18 @@ def test_sigma_of_narrow_strips_covers_their_error(strip):
     assert within[1] > 0.9
 
 
+@pytest.mark.parametrize("compensation", ["off", "on"])
+def test_sigma_has_what_texture_moves_the_rows_by(compensation):
+    camera = Camera(periods=30)
+    texture_px = np.random.default_rng(8).normal(0.0, 0.6, 1280)
+    settings = {"reflectance_compensation": compensation, "stage_speed_mm_s": 50.0}
+    found, _ = points(camera, camera.line(lambda k, c: wavy(k, c) + texture_px[c]), **settings)
+    later = found.select(found.period >= 4)
+    within = [np.mean(np.abs(error_px(later)) < k * later.sigma_row) for k in (1.0, 2.0)]
+    assert 0.55 < within[0] < 0.8, f"seeds {camera.seed} and 8"
+    assert within[1] > 0.9
+
+
 def test_sigma_has_what_all_rows_jump_by_from_profile_to_profile():
     """As where a readout takes longer than a burst, and a period begins anywhere in it."""
     camera = Camera(periods=40)
