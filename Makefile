@@ -190,7 +190,7 @@ build-package:
 	  && cmake --install $(BUILD)/$(NAME); } > $$LOG 2>&1 \
 	|| { tail -n 40 $$LOG; echo "Building $(NAME) failed; the whole log is in $$LOG"; exit 1; }
 
-# numba compiles again what has changed since, when it is used. No ROS: it goes beside the interfaces with --jobs.
+# numba compiles again what has changed since, when it is used. No ROS: it goes beside the interfaces.
 $(BUILD)/kernels.stamp: $(BUILD)/run.stamp
 	@echo "Compiling kernels, for some minutes"
 	@NUMBA_CACHE_DIR="$(BUILD)/numba" $(VENV)/bin/python -c 'from eschorty_ros.cli import main; main(["compile"])'

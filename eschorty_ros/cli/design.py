@@ -114,6 +114,7 @@ def command(
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near
+    # A value that is refused comes before the table.
     light = ""
     if power_mw is not None:
         light = _light(build, near, min(far, last), power_mw, wavelength_nm)

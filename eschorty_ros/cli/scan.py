@@ -115,11 +115,10 @@ def command(
     tables = None
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
-        given, of_file = stated(("calibration", "keep")), tables.get("reconstruction", {})
-        calibration = (
-            calibration if "calibration" in given else of_file.get("calibration", calibration)
-        )
-        keep = keep if "keep" in given else of_file.get("keep", keep)
+        values = {"calibration": calibration, "keep": keep}
+        given = {name: values[name] for name in stated(values)}
+        values |= tables.get("reconstruction", {}) | given
+        calibration, keep = values["calibration"], values["keep"]
     _check(scene, calibration, effects)
     job = one_scan.ScanJob(
         scene=scene,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.base.numbers import file_path
+from eschorty_ros.core.base.numbers import file_path, short
 
 _PARTIAL = ".eschorty-partial"
 NAME_MAX = 100
@@ -25,6 +25,11 @@ def is_bare_name(value: object) -> bool:
     """Return whether ``value`` names a file in a folder: no path, not hidden, on one line."""
     text = value if isinstance(value, str) and len(value) <= NAME_MAX else ""
     return text.isprintable() and not {"", "."} & {text[:1]} and not set("/\\") & set(text)
+
+
+def bare_name_fault(name: str, value: object) -> str:
+    """Return what is wrong with ``value``, the ``name``, as a bare name; ``""`` for nothing."""
+    return "" if is_bare_name(value) else f"{name} is {short(value)}; give {BARE_NAME}"
 
 
 def open_regular_file(

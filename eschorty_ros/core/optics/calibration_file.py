@@ -15,7 +15,13 @@ import yaml
 
 from eschorty_ros.core.base.arrays import file_path, short
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
-from eschorty_ros.core.base.files import BARE_NAME, atomic_write, config_path, is_bare_name
+from eschorty_ros.core.base.files import (
+    BARE_NAME,
+    atomic_write,
+    bare_name_fault,
+    config_path,
+    is_bare_name,
+)
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import parse_yaml, read_yaml
 from eschorty_ros.core.optics.range_model import (
@@ -235,8 +241,8 @@ def save_named_calibration(
 
 
 def _named_path(folder: str | os.PathLike[str], name: str) -> Path:
-    if not is_bare_name(name):
-        raise CalibrationError(f"name of the calibration is {short(name)}; give {BARE_NAME}")
+    if fault := bare_name_fault("name of the calibration", name):
+        raise CalibrationError(fault)
     return file_path("folder", folder) / f"{name.removesuffix('.yaml')}.yaml"
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 from eschorty_ros.control.calibration_sequence import CAPTURE_MAX_S
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.files import BARE_NAME, is_bare_name
-from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
 from eschorty_ros.nodes.ros.parameters import Param
@@ -61,5 +60,5 @@ def modulation_override(values: Mapping[str, Any]) -> Modulation | None:
 
 def check_record_name(name: str) -> None:
     """Raise ``ArgumentError`` unless the name, if any, is one in the folder of recordings."""
-    if name and not is_bare_name(name):
-        raise ArgumentError(f"record_name is {short(name)}; give {BARE_NAME}")
+    if name and (fault := bare_name_fault("record_name", name)):
+        raise ArgumentError(fault)

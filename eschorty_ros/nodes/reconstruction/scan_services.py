@@ -15,8 +15,7 @@ from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
-from eschorty_ros.core.base.files import BARE_NAME, is_bare_name
-from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
 from eschorty_ros.live.scan_recorder import ScanRecorder
@@ -118,9 +117,7 @@ class ScanServices:
         while fault and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
             fault = self._fault()
-        if not fault and not is_bare_name(request.scan_id):
-            fault = f"scan_id is {short(request.scan_id)}; give {BARE_NAME}"
-        if fault:
+        if fault := fault or bare_name_fault("scan_id", request.scan_id):
             response.success, response.message = False, fault
             return response
         limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
