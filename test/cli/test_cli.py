@@ -460,7 +460,7 @@ def test_a_bad_recording_does_not_end_the_others(recording, tmp_path, where):
     options = ["--json"]
     with contextlib.ExitStack() as stack:
         if where == "cluster":
-            distributed = pytest.importorskip("distributed")
+            distributed = pytest.importorskip("distributed", reason="distributed is not installed")
             local = distributed.LocalCluster(
                 n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
             )
