@@ -12,7 +12,7 @@ from typing import Any
 from numba import types
 from numba.experimental import structref
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 
 
 @structref.register
@@ -37,7 +37,7 @@ structref.define_constructor(Boxed, _BoxedType, ["content"])
 def _box() -> Any:
     """Return the kernel that boxes; made late, as its cache refers to the types of all contents."""
 
-    @kernel
+    @entry_kernel
     def _boxed(content):
         return Boxed(content)
 

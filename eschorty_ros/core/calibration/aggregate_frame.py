@@ -9,7 +9,7 @@ from numba import int64, types, uint16, uint32
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, integer
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.optics import PIXELS_MAX
 
 _COUNT_MAX = (1 << 32) - 1
@@ -61,7 +61,7 @@ class AggregateFrame:
         return np.rint(255.0 * np.sqrt(np.minimum(self.counts / white, 1.0))).astype(np.uint8)
 
 
-@kernel(int64(uint32[:, ::1], _U2, _U2))
+@entry_kernel(int64(uint32[:, ::1], _U2, _U2))
 def _count(counts, x, y):
     """Add each event on the sensor to its pixel, which saturates; return how many they are."""
     rows, columns = counts.shape

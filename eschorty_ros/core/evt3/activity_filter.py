@@ -14,7 +14,7 @@ from numba import int32, int64, typeof, types, uint8, uint16, uint64
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, _first_fall, event_arrays
 
 _COLUMN_BITS = 3
@@ -116,7 +116,7 @@ def _neighbours_fresh(cells, cell, pitch, oldest):
     )
 
 
-@kernel(uint64(_I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], _S))
+@entry_kernel(uint64(_I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], _S))
 def _filter(t_in, x_in, y_in, p_in, out, cells, s):
     """Compact the supported events into ``out``; return their number."""
     t_out, x_out, y_out, p_out = out

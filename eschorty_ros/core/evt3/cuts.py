@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.decoder import Decoder
 from eschorty_ros.core.evt3.state_machine import _FOREVER_US, _NO_ROW, _RUNNING, decode_into
@@ -87,7 +87,7 @@ def _scan(words, begin, end):
     return _Block(np.int64(events), high, base)
 
 
-@kernel
+@entry_kernel
 def _find(words, word, edge, edges_us, events, memory):
     """Advance the decoder to the next cut behind ``events`` events; return it, -1 for none.
 

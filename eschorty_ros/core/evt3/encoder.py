@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import integer, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.events import EventArrays, _first_fall
 
@@ -233,7 +233,7 @@ _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
 
 
-@kernel(uint64(int64, types.boolean, _STREAM, uint16[::1], uint64))
+@entry_kernel(uint64(int64, types.boolean, _STREAM, uint16[::1], uint64))
 def _put_time(t, idle, s, words, n):
     """Bring the stream's time to ``t``: write every TIME_HIGH on the way, then TIME_LOW.
 
@@ -313,7 +313,7 @@ def _put_row(k, end, x, y, p, s, words, n):
     return n
 
 
-@kernel(uint64(_I8, _U2, _U2, _U1, _I8, _U2, _STREAM, uint16[::1]))
+@entry_kernel(uint64(_I8, _U2, _U2, _U1, _I8, _U2, _STREAM, uint16[::1]))
 def _encode(t, x, y, p, mark_t, marks, s, words):
     """Merge events and marks by time, marks first; return the number of words."""
     n = np.uint64(0)

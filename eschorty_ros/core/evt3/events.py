@@ -9,7 +9,7 @@ import numpy as np
 from numba import int64, types, uint8, uint16
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.base.numbers import integer
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
@@ -75,7 +75,7 @@ EVENT_ARRAYS = types.NamedTuple((int64[::1], uint16[::1], uint16[::1], uint8[::1
 """``EventArrays`` as kernels take them."""
 
 
-@kernel(int64(types.Array(int64, 1, "C", readonly=True), int64))
+@entry_kernel(int64(types.Array(int64, 1, "C", readonly=True), int64))
 def _first_fall(t, last):
     """Return the index of the first time below its predecessor (``last`` for the first), or -1."""
     for k in range(t.size):

@@ -14,7 +14,7 @@ import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel, record, with_names
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record, with_names
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import ctz64, popcount64
 from eschorty_ros.core.evt3.counters import COUNTS
@@ -104,7 +104,7 @@ def _event_count(word):
     return np.uint64(0)
 
 
-@kernel(types.UniTuple(uint64, 2)(_WORDS))
+@entry_kernel(types.UniTuple(uint64, 2)(_WORDS))
 def _bounds(words):
     """Return upper bounds of the numbers of events and triggers in ``words``."""
     events = np.uint64(0)
@@ -479,7 +479,7 @@ def decode_into(emit: Any, name: str) -> Any:
 _decode_stored = decode_into(_emit, "stored")
 
 
-@kernel(types.UniTuple(uint64, 2)(_WORDS, _MEMORY, EVENT_ARRAYS))
+@entry_kernel(types.UniTuple(uint64, 2)(_WORDS, _MEMORY, EVENT_ARRAYS))
 def _decode_events(words, memory, out):
     """Decode all ``words``; return the numbers of events and triggers written.
 

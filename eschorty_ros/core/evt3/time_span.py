@@ -9,7 +9,7 @@ from numba import int64, types, uint16
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import byte_view
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.evt3 import words as w3
 
 WRAP_US = 1 << 24
@@ -66,7 +66,7 @@ def _words(data: bytes | bytearray | memoryview) -> NDArray[np.uint16]:
     return words if words.flags.aligned else words.copy()
 
 
-@kernel(types.UniTuple(int64, 2)(_WORDS))
+@entry_kernel(types.UniTuple(int64, 2)(_WORDS))
 def _begin(words):
     """Return the payloads of the first TIME_LOW and of the last TIME_HIGH before it, or -1."""
     high = -1
@@ -88,7 +88,7 @@ def _has_time(words, begin):
     return found > 0
 
 
-@kernel(int64(_WORDS))
+@entry_kernel(int64(_WORDS))
 def _steps(words):
     """Return the sum of the steps of the payloads of TIME_HIGH, modulo 4096 each."""
     total, last = 0, -1

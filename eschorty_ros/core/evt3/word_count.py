@@ -6,7 +6,7 @@ import numpy as np
 from numba import int64, typeof, types, uint16
 
 from eschorty_ros.core.base.arrays import byte_view
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import popcount64
 
@@ -72,7 +72,7 @@ def _add_payload(c, events):
         c.erc_events_out += int64(events)
 
 
-@kernel(types.void(types.Array(uint16, 1, "C", readonly=True), typeof(record(*_COUNTS))))
+@entry_kernel(types.void(types.Array(uint16, 1, "C", readonly=True), typeof(record(*_COUNTS))))
 def _count(words, c):
     """Add up events by polarity, triggers and the sensor's own loss reports."""
     for word in words:

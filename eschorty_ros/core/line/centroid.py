@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.line.column_returns import _column_returns, _is_clear, _is_cut, _reported
 from eschorty_ros.core.line.estimators import (
     _ALL,
@@ -293,7 +293,7 @@ def _pooled(out, estimator):
     return squares, freedom, events, lines
 
 
-@kernel(_nrt=False)
+@entry_kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out`` and empty the columns.
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.modulation.modulation import Modulation
 
 EDGES_MAX = 1 << 14
@@ -223,7 +223,7 @@ def _rounded(quotient, remainder, denominator):
     return quotient
 
 
-@kernel
+@entry_kernel
 def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indices):
     """Write the edges that are certain once everything before the watermark is known.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
 
@@ -56,7 +56,7 @@ def _words(points: NDArray[Any]) -> NDArray[np.uint32]:
     return points.view(_WORD).reshape(len(points), points.dtype.itemsize // _WORD.itemsize)
 
 
-@kernel
+@entry_kernel
 def _fill(points, t_ns, stamp_ns, live):
     """Copy points word by word; their time of two words becomes one since the stamp."""
     for i in range(np.uintp(t_ns.size)):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
@@ -321,7 +321,7 @@ def _merge_part(events, edges, i, edge, drain, memory):
         edge += 1
 
 
-@kernel
+@entry_kernel
 def _merge(held, new, edges, progress, boxed):
     """Merge events, first those of ``held``, with edges from ``progress`` on.
 
@@ -400,7 +400,7 @@ def _pass(words, progress, decoder, span, edges, memory, before):
     return _Progress(np.int64(i), edge)
 
 
-@kernel
+@entry_kernel
 def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     """Decode words into the open period and those that begin at the edges.
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
@@ -109,7 +109,7 @@ def _scale(model: RangeModel) -> _Scale:
     return _Scale(offset_px, model.product_mm_px, float(model.b_mm))
 
 
-@kernel
+@entry_kernel
 def _fill_ranges(row, sigma_row, column, scale, range_mm, sigma_mm):
     """Set ranges and deviations as `RangeModel` has them, in one pass; return how many are NaN."""
     beyond = 0
@@ -218,7 +218,7 @@ class _Lateral(NamedTuple):
     b_mm: float
 
 
-@kernel
+@entry_kernel
 def _fill_link(measured, lateral, origin_us, points):
     """Set all fields of points in the moving frame but those of a reflectance."""
     for i in range(np.uintp(points.size)):
@@ -300,7 +300,7 @@ def _positions(name: str, position_mm: ArrayLike, points: int) -> NDArray[np.flo
     return np.ascontiguousarray(position)
 
 
-@kernel
+@entry_kernel
 def _move(points, position_mm, direction):
     """Move points along the axes that the stage's direction has a part of."""
     x, y, z = direction[0], direction[1], direction[2]

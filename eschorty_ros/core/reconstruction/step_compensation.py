@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.line import ROOT_12, events_per_row
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
@@ -247,7 +247,7 @@ def _median(widths, column, lit_only, scratch):
     return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
 
 
-@kernel
+@entry_kernel
 def _shifts(points, history, number, newest):
     """Write the shift and the difference of each point of profile ``number``.
 
@@ -279,7 +279,7 @@ def _shifts(points, history, number, newest):
         points.difference_px[k] = history.rows[present, column] - expected
 
 
-@kernel
+@entry_kernel
 def _medians(widths, medians):
     """Write the median of the columns around each column; those without a point count as 0."""
     scratch = np.empty(2 * _REACH_COLUMNS + 1)

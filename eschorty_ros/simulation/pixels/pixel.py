@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.simulation.pixels._passage import DECISION_US, noise_table
 from eschorty_ros.simulation.pixels._pixel import (
     FULL,
@@ -332,7 +332,7 @@ def _add_patch(light, begin, end, patch):
         ratio *= step_ratio
 
 
-@kernel
+@entry_kernel
 def _relight(sensor, line, begin, optics, model, t_us, out, n):
     """Place the line in ``line.columns[begin:]`` from ``t_us`` on.
 
@@ -385,7 +385,7 @@ def _relight(sensor, line, begin, optics, model, t_us, out, n):
     return line.columns.size, n
 
 
-@kernel
+@entry_kernel
 def _run_columns(sensor, begin, until_us, model, out, n):
     """Process the pixels of the columns from ``begin`` on up to ``until_us``.
 
@@ -410,7 +410,7 @@ def _run_columns(sensor, begin, until_us, model, out, n):
     return pixels.shape[0], n
 
 
-@kernel
+@entry_kernel
 def _rebias_columns(sensor, t_us, before, after):
     for column in range(sensor.columns.size):
         state = sensor.columns[column]
@@ -418,7 +418,7 @@ def _rebias_columns(sensor, t_us, before, after):
         state.due_begin, state.due_end, state.due_us = begin, end, due_us
 
 
-@kernel
+@entry_kernel
 def _add_background(process, background, until_us, out, n):
     """Add the background events up to ``until_us``; stop at a full output.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 
 DROP_NOTE_US = 1000
 """Least time between two reports of the sensor that its readout drops events."""
@@ -236,7 +236,7 @@ def _serve(until_us, state, queue, out):
     out.counts.keys = n
 
 
-@kernel
+@entry_kernel
 def _read_out(requests, until_us, state, queue, out):
     """Pass sorted requests through the arbiter."""
     heads = queue.heads

@@ -17,9 +17,9 @@ def _scaled(x):
 """
 CALLER = """
 from callee import FACTOR, _scaled
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 
-@kernel{signature}
+@entry_kernel{signature}
 def _total(x):
     return _scaled(x) + FACTOR
 
@@ -61,13 +61,13 @@ def test_an_argument_type_that_exists_no_more_does_not_break_the_cache(tmp_path)
     """The cache's index refers to argument types by module and name."""
     code = """
 from typing import NamedTuple
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import entry_kernel
 
 class {name}(NamedTuple):
     first: int
     second: int
 
-@kernel
+@entry_kernel
 def _sum(pair):
     return pair.first + pair.second
 """
@@ -93,6 +93,19 @@ def _scaled(x):
     (tmp_path / "below.py").write_text(code)
     call = "try:\n    import below\nexcept NameError as error:\n    print(error)"
     assert output(tmp_path, "-c", call) == "_total uses _scaled; define it above\n"
+
+
+def test_a_kernel_that_only_kernels_call_refuses_a_call_from_python(tmp_path):
+    """It would crash; also one that comes from the cache, in the second process."""
+    (tmp_path / "callee.py").write_text(CALLEE.format(factor=10, scale=2))
+    (tmp_path / "caller.py").write_text(CALLER.format(signature=""))
+    call = (
+        "import caller\ntry:\n    caller._scaled(1)\nexcept TypeError as error:\n    print(error)"
+    )
+    for _ in range(2):
+        assert output(tmp_path, "-c", call) == (
+            "12\nonly kernels call _scaled; make it an entry_kernel\n"
+        )
 
 
 def test_boxed_arrays_are_compiled_once():

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evt3_oracle import SlowDecoder
+from from_python import from_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import RECORDING_SHARES, recording_like_words, words_of
@@ -17,6 +18,7 @@ from eschorty_ros.core.evt3.events import event_arrays
 from eschorty_ros.core.evt3.state_machine import _decode_stored, _trigger_arrays
 from eschorty_ros.core.storage.raw_file import RawReader
 
+decode_stored = from_python(_decode_stored)
 RECORDING = Path(__file__).parents[4] / "shared/data/evt3_gen41_sample.raw"
 
 
@@ -217,7 +219,7 @@ def test_passes_that_stop_before_late_events_give_the_same(
     memory = decoder.memory._replace(triggers=_trigger_arrays(data.size))
     for until_us in (*t_us, 1 << 62):
         out = event_arrays(12 * data.size)
-        i, n, m = _decode_stored(data, np.uint64(i), until_us, True, memory, out)
+        i, n, m = decode_stored(data, np.uint64(i), until_us, True, memory, out)
         events += list(zip(*(values[:n].tolist() for values in out), strict=True))
         found += list(zip(*(values[:m].tolist() for values in memory.triggers), strict=True))
         assert all(event[0] < until_us for event in events)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from eschorty_experiments._crossing import SPEED_MM_S, Crossing, crossing
+from from_python import from_python
 from independent_pixels import FIRST_EDGE_US, Camera, stream, wavy
 from reconstructing import assert_same, reconstruct
 
@@ -168,6 +169,7 @@ def test_shift_agrees_with_lit_rows_counted(low, high):
     """Rows lit on either side of a step at every offset, against the centroid's closed form."""
     half_low, half_high = low / 2, high / 2
     y = np.arange(-15.0, 15.0, 0.01) + 0.005
+    centroid_shift = from_python(_centroid_shift)
     for offset in np.arange(-12.0, 12.0, 0.5):
         wide = y < offset
         lit = np.where(wide, np.abs(y) < half_high, np.abs(y) < half_low)
@@ -175,8 +177,8 @@ def test_shift_agrees_with_lit_rows_counted(low, high):
             continue
         width, centre = lit.sum() * 0.01, y[lit].mean()
         # The new surface, at low rows, is the wider one: the centroid moves down.
-        assert -_centroid_shift(low, width, high) == pytest.approx(centre, abs=0.02)
-        assert _centroid_shift(high, width, low) == pytest.approx(centre, abs=0.02)
+        assert -centroid_shift(low, width, high) == pytest.approx(centre, abs=0.02)
+        assert centroid_shift(high, width, low) == pytest.approx(centre, abs=0.02)
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.04, 1.0), (1.0, 0.1), (0.2, 0.8)])

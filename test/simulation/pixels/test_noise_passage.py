@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from from_python import from_python
 
 from eschorty_ros.simulation.pixels._passage import GAP_MAX, GAP_MIN, GAP_STEPS, noise_table
 from eschorty_ros.simulation.pixels._prompt import _prompt, passage_gaps, way_times
@@ -11,6 +12,7 @@ from eschorty_ros.simulation.pixels._response import OFF, ON, UNKNOWN, Levels, S
 
 TAU_DARK_US, THRESHOLD = 159.15, 0.25
 DRAWS = (np.arange(400) + 0.5) / 400
+prompt = from_python(_prompt)
 
 
 def summed(u: float, settled: float, follower_us: float, noise: float, dt_us: float) -> np.ndarray:
@@ -36,7 +38,7 @@ def test_time_of_the_passage_agrees_with_the_summed_risk(light, follower_us, noi
     gaps = passage_gaps(noise_table(follower_us), follower_us)
     levels = Levels(u * math.exp(-THRESHOLD), u * math.exp(THRESHOLD))
     signal = Signal(u, u, settled, TAU_DARK_US * settled, follower_us)
-    found = [_prompt(signal, levels, noise, way_times(), gaps, draw) for draw in DRAWS]
+    found = [prompt(signal, levels, noise, way_times(), gaps, draw) for draw in DRAWS]
     assert {what for _, what in found} == {ON if rising else OFF}
     t_us = np.array([after_us for after_us, _ in found])
     wanted = summed(u, settled, follower_us, noise, 0.02)
@@ -49,5 +51,5 @@ def test_levels_the_signal_hardly_reaches_are_not_looked_up():
     gaps = passage_gaps(noise_table(8.0), 8.0)
     for light in (1.0, 1.05, 1.29):
         signal = Signal(1.0, 1.0, 1.0 / light, TAU_DARK_US / light, 8.0)
-        after_us, what = _prompt(signal, Levels(0.78, 1.28), 0.04, way_times(), gaps, 0.5)
+        after_us, what = prompt(signal, Levels(0.78, 1.28), 0.04, way_times(), gaps, 0.5)
         assert (after_us, what) == (math.inf, UNKNOWN)
