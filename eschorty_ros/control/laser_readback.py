@@ -45,7 +45,9 @@ class LaserRecord:
     def status(self) -> LaserStatus | None:
         """The last read-back, ``None`` before the first."""
         readback = self.readback
-        return None if readback is None else LaserStatus(self.requested, readback, self.reason)
+        if readback is None:
+            return None
+        return LaserStatus(self.requested, readback, self.unknown or self.reason)
 
     def receive(self, readback: LaserReadback) -> list[str]:
         """Take a read-back; returns those of its warnings that are new."""

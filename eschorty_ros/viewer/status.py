@@ -15,6 +15,7 @@ class Status:
     reason: str = ""
     phase: str = ""
     progress: float = 0.0
+    scan_id: str = ""
     message: str = ""
     events_per_second: float = float("nan")
     counts: dict[str, int] = field(default_factory=dict)
@@ -23,8 +24,9 @@ class Status:
         """Return the text of the page."""
         rows = [
             ("laser", f"**{self.laser}** {self.reason}"),
-            ("scan", f"{self.phase} {self.progress:.0%}" if self.phase else "none"),
-            ("events/s", "" if self.events_per_second != self.events_per_second
+            ("scan", f"{self.phase} {self.progress:.0%}" if self.phase
+             else self.scan_id or "none"),
+            ("events/s", "no report" if self.events_per_second != self.events_per_second
              else f"{self.events_per_second:,.0f}"),
             *((name.replace("_", " "), f"{count:,}") for name, count in self.counts.items()),
             ("points here", points_text(received, stride)),

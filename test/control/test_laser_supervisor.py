@@ -14,7 +14,7 @@ from eschorty_ros.control.laser_readback import LaserStatus
 from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
 
 
 @pytest.fixture
@@ -110,6 +110,38 @@ def test_a_trip_stays_the_reason_until_it_is_armed_again(laser):
     supervisor.arm()
     supervisor.disable("switched off by request")
     assert seen[-1].reason == "switched off by request"
+    supervisor.close()
+
+
+class Lost(DelayedLaser):
+    """Cannot be reached once it is ``gone``."""
+
+    gone = False
+
+    def disable(self) -> None:
+        if self.gone:
+            raise DeviceError("switch the generator off by hand")
+        super().disable()
+
+    def readback(self) -> LaserReadback:
+        if self.gone:
+            raise DeviceError("no answer")
+        return super().readback()
+
+
+def test_what_to_do_about_an_unknown_output_comes_before_what_tripped_it():
+    laser, seen = Lost(), []
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, seen.append)
+    supervisor.arm()
+    supervisor.enable()
+    laser.gone = True
+    assert not supervisor.trip("camera/heartbeat reports stopped")
+    assert seen[-1].readback.output is LaserOutput.UNKNOWN
+    assert "switch the generator off by hand" in seen[-1].reason
+    laser.gone = False
+    wait_until(lambda: seen[-1].readback.output is LaserOutput.OFF, "the read-back")
+    assert "switch the generator off by hand" not in seen[-1].reason
     supervisor.close()
 
 

@@ -4,14 +4,19 @@ MESSAGE_MAX = 280
 """Characters of a message; a longer one loses its middle, not the thing and the remedy."""
 
 
+def one_line(message: str) -> str:
+    """Return a message as one line of `MESSAGE_MAX` characters at most."""
+    text = " ".join(message.splitlines())
+    if len(text) <= MESSAGE_MAX:
+        return text
+    return f"{text[: MESSAGE_MAX - 104]} ... {text[-99:]}"
+
+
 class EschortyError(Exception):
     """A failure a user can cause or cure; command line and nodes print it without a traceback."""
 
     def __init__(self, message: object = "") -> None:
-        text = " ".join(str(message).splitlines())
-        if len(text) > MESSAGE_MAX:
-            text = f"{text[: MESSAGE_MAX - 104]} ... {text[-99:]}"
-        super().__init__(text)
+        super().__init__(one_line(str(message)))
 
 
 class ArgumentError(EschortyError, ValueError):

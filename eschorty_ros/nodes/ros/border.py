@@ -71,7 +71,7 @@ def _name(node: Node, entity: Any) -> str:
 
 
 def check_text(name: str, text: str) -> str:
-    """Return ``text`` unless it is longer than 200 characters."""
+    """Return an identifier unless it is longer than 200 characters."""
     if len(text) > _TEXT_MAX:
         raise ArgumentError(f"{name} has {len(text)} characters; send {_TEXT_MAX} at most")
     return text

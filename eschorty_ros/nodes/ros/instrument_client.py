@@ -28,6 +28,7 @@ from eschorty_ros.control.instrument_monitor import (
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
+from eschorty_ros.core.base.errors import one_line
 from eschorty_ros.core.base.numbers import number
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.live.device_messages import ns_from_stamp
@@ -376,9 +377,8 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
 
     def on_laser(message: LaserState, info: Mapping[str, Any]) -> None:
         laser.check(info)
-        reason = check_text("reason", message.reason)
         monitor.update_laser(
-            LaserReport(message.output, message.frequency, message.duty, reason),
+            LaserReport(message.output, message.frequency, message.duty, one_line(message.reason)),
             age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 

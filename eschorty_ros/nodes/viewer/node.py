@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
 
 from eschorty_ros.action import Scan
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError, one_line
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
@@ -38,7 +39,7 @@ TABLE = (
 )  # fmt: skip
 
 _SHOW_S = 0.4
-_LASER_TIMEOUT_S = 2.0
+_REPORT_TIMEOUT_S = 2.0
 # The scanner sends feedback ten times a second.
 _SCANNER_TIMEOUT_S = 10.0
 _COUNTS = (
@@ -59,9 +60,8 @@ class ViewerNode(Node):
             self._cloud, self._control, self.parameters["host"], self.parameters["port"]
         )
         self._status = Status()
-        self._laser_s = float("-inf")
+        self._laser_s = self._reconstruction_s = float("-inf")
         self._interlock_open = True
-        self._scan_id = ""
         self._handle: Any = None
         self._cancel_wanted = False
         self._scanner_s = float("-inf")
@@ -126,21 +126,22 @@ class ViewerNode(Node):
         self._laser_s = time.monotonic()
         self._interlock_open = bool(message.interlock_open)
         self._status.laser = laser_text(message.output, message.armed)
-        self._status.reason = check_text("reason", message.reason)
+        self._status.reason = one_line(message.reason)
 
     def _on_state(self, message: ReconstructionState) -> None:
+        self._reconstruction_s = time.monotonic()
         self._status.events_per_second = float(message.events_per_second)
         self._status.counts = {name: int(getattr(message, name)) for name in _COUNTS}
         scan_id = check_text("scan_id", message.scan_id)
-        if scan_id and scan_id != self._scan_id:
+        if scan_id and scan_id != self._status.scan_id:
             self._cloud.clear()
-        self._scan_id = scan_id
+        self._status.scan_id = scan_id
 
     def _conditions(self) -> Conditions:
         return Conditions(
             scanner=self._scan.server_is_ready(),
-            scanning=bool(self._scan_id) or self._control.under_way,
-            laser=time.monotonic() - self._laser_s < _LASER_TIMEOUT_S,
+            scanning=bool(self._status.scan_id) or self._control.under_way,
+            laser=time.monotonic() - self._laser_s < _REPORT_TIMEOUT_S,
             interlock_open=self._interlock_open,
         )
 
@@ -157,8 +158,12 @@ class ViewerNode(Node):
         self._cancel_wanted |= cancel or self._control.abandoned(self.page.pages)
         if self._handle is not None and self._cancel_wanted:
             self._handle.cancel_goal_async()
-        if time.monotonic() - self._laser_s >= _LASER_TIMEOUT_S:
+        now_s = time.monotonic()
+        if now_s - self._laser_s >= _REPORT_TIMEOUT_S:
             self._status.laser, self._status.reason = "no report", ""
+        if now_s - self._reconstruction_s >= _REPORT_TIMEOUT_S:
+            self._status.events_per_second, self._status.counts = math.nan, {}
+            self._status.scan_id = ""
         profile, self._profile = self._profile, None
         frame, self._frame = self._frame, None
         self.page.show(self._status.markdown, profile, frame)
@@ -191,6 +196,9 @@ class ViewerNode(Node):
         )
         if not values.record:
             self._send(goal)
+            return
+        if not self._get_parameters.service_is_ready():
+            self._end("not started: no reconstruction to record; start its node")
             return
 
         def on_value(future: Any) -> None:
@@ -241,7 +249,7 @@ class ViewerNode(Node):
     def _on_feedback(self, message: Any) -> None:
         self._scanner_s = time.monotonic()
         state = message.feedback
-        self._status.phase = check_text("phase", state.waits_for or state.phase)
+        self._status.phase = one_line(state.waits_for or state.phase)
         self._status.progress = float(state.progress)
 
     def _on_result(self, handle: Any, future: Any) -> None:

@@ -8,12 +8,13 @@ import time
 import pytest
 import rclpy
 from eschorty_ros.action import Scan
-from eschorty_ros.msg import LaserState
+from eschorty_ros.msg import LaserState, ReconstructionState
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.border import refusals
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.viewer import node as viewer_module
 from eschorty_ros.nodes.viewer.node import ViewerNode
@@ -31,12 +32,12 @@ def free_port():
 class Instrument(Node):
     """Answers as scanner, reconstruction and laser do."""
 
-    def __init__(self, interlock_open=False):
+    def __init__(self, **state):
         super().__init__("reconstruction", namespace="/eschorty")
         self.declare_parameter("record", "/before")
         self.goals, self.recorded = [], []
         self.release, self.stopped = threading.Event(), False
-        self._state = LaserState(interlock_open=interlock_open)
+        self._state = LaserState(**state)
         self._publisher = self.create_publisher(LaserState, "laser/state", qos.latched(100))
         self.create_timer(0.1, lambda: self._publisher.publish(self._state))
         self._server = ActionServer(
@@ -159,3 +160,39 @@ def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
         wait(lambda: second.goals)
         second.release.set()
         wait(says(viewer, "complete"))
+
+
+def test_the_page_shows_who_scans_and_why_the_laser_is_off_until_nobody_reports(world, monkeypatch):
+    monkeypatch.setattr(viewer_module, "_REPORT_TIMEOUT_S", 1.0)
+    viewer, instrument = world
+    reason = f"treat the laser as on {'-' * 400} by hand"
+
+    def shows(*texts):
+        return lambda: all(text in viewer._status.markdown(0, 1) for text in texts)
+
+    assert shows("| scan | none |", "| events/s | no report |")()
+    with instrument(output=LaserState.OUTPUT_UNKNOWN, reason=reason) as node:
+        state = ReconstructionState(scan_id="of another client", events_per_second=5e5, points=7)
+        publisher = node.create_publisher(ReconstructionState, "reconstruction/state", 10)
+        timer = node.create_timer(0.1, lambda: publisher.publish(state))
+        wait(shows("**unknown** treat the laser as on ---", "--- by hand", "of another client"))
+        wait(shows("500,000", "| points | 7 |"))
+        assert viewer._conditions().scanning
+        timer.cancel()
+        wait(shows("| scan | none |", "| events/s | no report |"))
+        assert "| points |" not in viewer._status.markdown(0, 1)
+        assert not viewer._conditions().scanning
+    assert not refusals(viewer).counts
+
+
+def test_a_scan_that_is_to_be_recorded_needs_a_reconstruction(world):
+    viewer, instrument = world
+    with instrument() as node:
+        wait(lambda: not viewer._conditions().refusal())
+        for service in list(node.services):
+            if "parameters" in service.service_name:
+                node.destroy_service(service)
+        wait(lambda: not viewer._get_parameters.service_is_ready())
+        ask(viewer, VALUES._replace(record="/data"))
+        wait(says(viewer, "not started: no reconstruction to record"))
+        assert not node.goals
