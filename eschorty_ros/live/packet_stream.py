@@ -64,7 +64,6 @@ class PacketStream:
     - ``announcements_refused``: Announced zeros that contradict the packets' stamps, which serve
       instead.
     - ``announcement_expected``: True while packets wait for an announcement of the camera's zero.
-    - ``laser_hz``: Frequency that the laser reports, 0 while unknown; only compared.
     """
 
     def __init__(
@@ -83,7 +82,6 @@ class PacketStream:
         self.clock_restarts = 0
         self.announcements_refused = 0
         self.announcement_expected = True
-        self.laser_hz = 0.0
         self._packet_period_ns = round(packet_period_s * 1e9)
         self._settings = settings
         self._clock_timeout_s = clock_timeout_s
@@ -94,7 +92,8 @@ class PacketStream:
         self._epoch_used = False
         self._zero_ended = False
         self._recorder: ScanRecorder | None = None
-        self._laser: tuple[Modulation, int | None] | None = None
+        self._reported: tuple[Modulation, int | None] | None = None
+        self._override: Modulation | None = None
         self._on_since_ns: int | None = None
         self._reconstructor: Reconstructor | None = None
         self._wraps = 0
@@ -120,6 +119,11 @@ class PacketStream:
         if self._epoch is None:
             return "camera clock"
         return "sensor's time" if self._reconstructor is None and self._held else ""
+
+    @property
+    def _laser(self) -> tuple[Modulation, int | None] | None:
+        """Return the modulation that is used and the ROS time of an edge, as far as known."""
+        return self._reported if self._override is None else (self._override, None)
 
     @property
     def epoch(self) -> SensorEpoch | None:
@@ -165,6 +169,11 @@ class PacketStream:
 
         Where it is not known when the laser is on they are about the stream since the scan began.
         """
+        if 2 * self.restarts > self.packets > 1:
+            return [
+                f"camera/events began again {self.restarts:,} times in {self.packets:,} packets; "
+                "seq has to be one more with each packet: let the driver number them"
+            ]
         if self._last_warnings is not None:
             return self._last_warnings
         reconstructor, wanted = self._reconstructor, self._settings.periods_per_profile
@@ -173,10 +182,11 @@ class PacketStream:
         used = reconstructor.settings.periods_per_profile
         limited = f"periods_per_profile is {wanted}; {self.frequency_hz:g} Hz allows {used}"
         lines = [limited] if used < wanted else []
-        if abs(self.frequency_hz / (self.laser_hz or self.frequency_hz) - 1.0) > _OTHER_FREQUENCY:
+        reported_hz = self._reported[0].frequency_hz if self._reported else self.frequency_hz
+        if abs(self.frequency_hz / reported_hz - 1.0) > _OTHER_FREQUENCY:
             lines.append(
-                f"frequency is {self.frequency_hz:g} Hz and the laser reports {self.laser_hz:g} "
-                "Hz; correct it, or set it to 0"
+                f"frequency is {self.frequency_hz:g} Hz and the laser reports {reported_hz:g} Hz; "
+                "correct it, or set it to 0"
             )
         if self._changed_while_on:
             lines.append("the laser's modulation was changed while it was on")
@@ -222,28 +232,39 @@ class PacketStream:
         """Use this modulation and ROS time of one rising edge for packets processed later.
 
         ``on_since_ns`` is when the laser was switched on, ``None`` while it is off. Its phase
-        restarts then, unless ``epoch_ns`` gives it.
+        restarts then, unless ``epoch_ns`` gives it. An override goes before the modulation.
         """
         switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
         if on_since_ns is None and self._on_since_ns is not None:
             # Periods without light have few events, and follow no laser.
             self._last_warnings = self.warnings
         self._on_since_ns = on_since_ns
-        changed = (modulation, epoch_ns) != self._laser
-        other = self._laser is not None and modulation != self._laser[0]
-        self._changed_while_on |= other and on_since_ns is not None
-        self._laser = modulation, epoch_ns
-        if self._reconstructor is not None and changed:
-            if self._reconstructor.settings != self._settings.allowed(modulation):
-                self._renew()
-            else:
-                self._reconstructor.set_modulation(self._modulation())
+        before, self._reported = self._laser, (modulation, epoch_ns)
+        self._follow_laser(before)
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
         if switched_on:
             self._restart_warnings()
         if self._recorder is not None and switched_on:
             self._recorder.laser_on()
+
+    def set_override(self, modulation: Modulation | None) -> None:
+        """Use this modulation instead of the laser's, which ``None`` restores."""
+        before, self._override = self._laser, modulation
+        self._follow_laser(before)
+
+    def _follow_laser(self, before: tuple[Modulation, int | None] | None) -> None:
+        """Reconstruct with what is used of the laser, where that differs from ``before``."""
+        if before is None or before == self._laser:
+            return
+        modulation = self._laser[0] if self._laser is not None else None
+        self._changed_while_on |= modulation != before[0] and self._on_since_ns is not None
+        if self._reconstructor is None:
+            return
+        if modulation and self._reconstructor.settings == self._settings.allowed(modulation):
+            self._reconstructor.set_modulation(self._modulation())
+        else:
+            self._renew()
 
     def set_pulses(self, pulses: PulseTrain | None) -> None:
         """Expect these pulses, or none, if the trigger input is wired to the stage."""
@@ -449,8 +470,10 @@ class PacketStream:
         self._retired.update(reconstructor.counters)
 
     def _collect(self, profiles: Profiles) -> None:
-        if len(profiles):
-            assert self._epoch is not None
+        assert self._epoch is not None
+        if self._epoch.clock.line is None:
+            self._retired["points_without_time"] += len(profiles)
+        elif len(profiles):
             build = self._model, self.calibration.stage_direction
             shift_us = self._wraps * WRAP_US
             self._out.append(TimedProfiles.within(self._epoch, profiles, shift_us, *build))

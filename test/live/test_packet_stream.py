@@ -548,12 +548,36 @@ def test_warnings_are_about_the_light_that_is_on_or_was_last():
 def test_a_frequency_other_than_the_lasers_has_a_warning():
     made = stream()
     made.announce_zero(ZERO_NS)
-    made.set_laser(Modulation(140.0), ZERO_NS + EDGE_US * 1000)
+    made.set_override(Modulation(140.0))
     push(made, packets(line()))
-    made.laser_hz = 140.0
+    made.set_laser(Modulation(140.0), None)
     assert not [text for text in made.warnings if "the laser reports" in text]
-    made.laser_hz = 70.0
+    made.set_laser(Modulation(70.0), None)
     assert "frequency is 140 Hz and the laser reports 70 Hz" in made.warnings[0]
+
+
+def test_without_an_override_the_laser_counts_again_and_the_change_has_a_warning():
+    parts = packets(line())
+    made, plain = (stream() for _ in range(2))
+    found = []
+    for subject in (made, plain):
+        subject.announce_zero(ZERO_NS)
+        subject.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000, on_since_ns=ZERO_NS)
+    made.set_override(Modulation(140.0))
+    assert made.frequency_hz == 140.0
+    made.set_override(None)
+    assert made.frequency_hz == MODULATION.frequency_hz
+    found = [joined(run(subject, parts)).row for subject in (made, plain)]
+    assert np.array_equal(*found)
+    assert "the laser's modulation was changed while it was on" in made.warnings
+    made.set_override(Modulation(140.0))
+    made.set_laser(MODULATION, None, None)
+    made.set_laser(MODULATION, None, ZERO_NS + 1)
+    assert made.frequency_hz == 140.0
+    alone = stream()
+    alone.set_override(MODULATION)
+    alone.set_override(None)
+    assert alone.waits_for == "modulation"
 
 
 def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning():
@@ -569,3 +593,11 @@ def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning():
     made.set_laser(MODULATION, epoch_ns, None)
     made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS + 1)
     assert not [text for text in made.warnings if "changed" in text]
+
+
+def test_packets_without_numbers_have_a_warning():
+    """Some end before the clock knows a time."""
+    subject = unannounced()
+    run(subject, [replace(packet, seq=0) for packet in packets(line(), size=20_000)])
+    assert "seq has to be one more with each packet" in subject.warnings[0]
+    assert subject.counters["points_without_time"] > 0

@@ -98,8 +98,7 @@ class ReconstructionNode(Node):
             self.parameters["stage_timeout"],
             self.parameters["packet_period"],
         )
-        if self._override is not None:
-            self._pipeline.stream.set_laser(self._override, None)
+        self._pipeline.stream.set_override(self._override)
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
@@ -214,9 +213,7 @@ class ReconstructionNode(Node):
 
     def _on_laser(self, message: LaserState, info: Mapping[str, Any]) -> None:
         self._laser.check(info)
-        self._pipeline.stream.laser_hz = float(message.frequency)
-        if self._override is None:
-            self._post(partial(self._pipeline.stream.set_laser, *laser_settings(message)))
+        self._post(partial(self._pipeline.stream.set_laser, *laser_settings(message)))
 
     def _on_trigger(self, message: PositionTrigger) -> None:
         self._post(partial(self._pipeline.stream.set_pulses, pulse_train(message)))
@@ -342,8 +339,7 @@ class ReconstructionNode(Node):
         self._post(partial(self._pipeline.stream.set_settings, settings))
         self._jobs.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override
-        if override is not None:
-            self._post(partial(self._pipeline.stream.set_laser, override, None))
+        self._post(partial(self._pipeline.stream.set_override, override))
 
 
 def main() -> int:
