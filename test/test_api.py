@@ -25,3 +25,20 @@ def test_settings_are_checked_and_an_empty_cloud_is_not_saved(tmp_path):
     plain = es.reconstruct(tmp_path)
     assert np.median(plain.points["x"] - other.points["x"]) == pytest.approx(5e-3, abs=1e-6)
     assert "given as 71 Hz" in es.reconstruct(tmp_path, frequency_hz=71.0).warnings[0]
+
+
+def test_settings_may_be_numpys_numbers_and_a_wrong_type_is_one_line():
+    settings = es.Settings(events_min=np.int64(5), line_width_px=np.float32(20.0), range_max=2)
+    assert settings == es.Settings(events_min=5, line_width_px=20.0, range_max=2.0)
+    assert (type(settings.events_min), type(settings.range_max)) == (int, float)
+    for value in (np.bool_(True), np.float64(5.0), "5"):
+        with pytest.raises(es.EschortyError, match=r"events_min is .*; choose a whole number"):
+            es.Settings(events_min=value)
+    build, modulation = es.load_calibration("config_3"), es.Modulation(70.0)
+    for arguments, text in (
+        (("config_3", modulation), "calibration is 'config_3'; give a Calibration"),
+        ((build, 70.0), "modulation is 70.0; give a Modulation"),
+        ((build, modulation, {"events_min": 5}), "settings is .*; give a Settings"),
+    ):
+        with pytest.raises(es.EschortyError, match=text):
+            es.Reconstructor(*arguments)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer
+from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer, short
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
@@ -93,7 +93,14 @@ class Reconstructor:
         settings: Settings | None = None,
         jobs: int = 1,
     ) -> None:
-        self.settings = settings = settings or Settings()
+        self.settings = settings = Settings() if settings is None else settings
+        for name, value, kind in (
+            ("calibration", calibration, Calibration),
+            ("modulation", modulation, Modulation),
+            ("settings", settings, Settings),
+        ):
+            if not isinstance(value, kind):
+                raise ArgumentError(f"{name} is {short(value)}; give a {kind.__name__}")
         self.model = calibration.model()
         self._first_row, model = window_model(calibration)
         self._window_model = model

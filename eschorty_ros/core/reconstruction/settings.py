@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
 from typing import Any, Self
 
 from eschorty_ros.core.base.arrays import short
@@ -187,7 +188,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            _check(item.name, getattr(self, item.name), item.default, item.metadata)
+            value = _checked(item.name, getattr(self, item.name), item.default, item.metadata)
+            object.__setattr__(self, item.name, value)
         check_method(self.centroid, self.returns)
         if self.column_last < self.column_first:
             raise ArgumentError(
@@ -227,19 +229,21 @@ class Settings:
         return self if self.periods_per_profile <= most else replace(self, periods_per_profile=most)
 
 
-def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
+def _checked(name: str, value: Any, default: Any, metadata: Any) -> Any:
+    """Return the value, numpy's as Python's of the default's type, unless it is out of range."""
     if "choices" in metadata:
         if value not in metadata["choices"]:
             raise ArgumentError(
                 f"{name} is {short(value)}; choose one of {', '.join(metadata['choices'])}"
             )
-        return
+        return value
     low, high = metadata["range"]
     integral = isinstance(default, int)
     kind = "a whole number" if integral else "a number"
-    accepted = isinstance(value, int if integral else (int, float)) and not isinstance(value, bool)
+    accepted = isinstance(value, Integral if integral else Real) and not isinstance(value, bool)
     if not accepted or not low <= value <= high:
         unit = f" {metadata['unit']}" if metadata["unit"] else ""
         raise ArgumentError(
             f"{name} is {short(value)}; choose {kind} from {low:g} to {high:g}{unit}"
         )
+    return type(default)(value)
