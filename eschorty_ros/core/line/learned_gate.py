@@ -184,14 +184,17 @@ def _learn_gate(columns, half, gate):
     best, least = 0, np.sqrt(_VARIANCE_MAX) * scatter
     for k in range(1, gate.choices.size):
         if _fill_rows(columns, half, gate.choices[k], gated) < _FOUND_MIN * found:
-            continue
+            # A shorter one keeps fewer.
+            break
         scatter = _median_difference(gated)
         if scatter < least and not _move_together(gated, row):
             best, least = k, scatter
-    choice = gate.choices[best]
+    late = _usual_late(columns, gate.choices[best]) if best > 0 else 0
+    # Of columns with more late events than usual all count: where none is usual, of all columns.
+    choice = gate.choices[best if late > 0 else 0]
     state.known, state.changed = 1, choice.on_span != state.on_span
     _copy_gate(choice, state)
-    state.late, state.half = _usual_late(columns, choice), half
+    state.late, state.half = late, half
     return changed
 
 

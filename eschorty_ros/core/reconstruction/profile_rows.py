@@ -202,8 +202,8 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
-            float(settings.smoothing_gate_px),
-            float(settings.isolation_gate_px),
+            settings.smoothing_gate_px,
+            settings.isolation_gate_px,
             settings.isolation_events,
             empty_widths(*shape, settings.sigma_common_px, windowed),
         ),
