@@ -6,6 +6,7 @@ Usage: python docs/interfaces.py (or make reference).
 from __future__ import annotations
 
 import os
+import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -108,7 +109,7 @@ def every_node() -> Iterator[list[Node]]:
             mock.patch.object(replay, "RawReader"),
             mock.patch.object(replay.ReplayNode, "_run"),
         ):
-            nodes.append(replay.ReplayNode(parameter_overrides=playing))
+            nodes.append(replay.ReplayNode(threading.Event(), parameter_overrides=playing))
         with mock.patch.object(viewer, "Page"):
             nodes.append(viewer.ViewerNode())
         yield nodes

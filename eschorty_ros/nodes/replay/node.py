@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ TABLE = (
 _PACKETS_AHEAD = 256
 _ROWS_AHEAD = 1000
 _POLL_S = 0.005
+_INTERRUPTED = 130
 
 
 class ReplayNode(Node):
@@ -54,10 +56,13 @@ class ReplayNode(Node):
     The stamps are the recording's times, shifted to begin at the present ROS time; the rate does
     not change them. The node stays at most a bounded number of messages ahead of the
     reconstruction, so that a reliable subscription loses nothing.
+
+    - ``played``: Set when all is published and the scan has ended.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(self, played: threading.Event, **kwargs: Any) -> None:
         # First, because a node whose constructor fails is destroyed, too.
+        self._played = played
         self._closing = threading.Event()
         self._player = threading.Thread(target=self._run, name="replay", daemon=True)
         super().__init__("replay", **kwargs)
@@ -82,9 +87,21 @@ class ReplayNode(Node):
         self._advanced_s = time.monotonic()
         self._zero_ns = 0
         self._next_row = 0
+        self._scan_id = ""
         self._failure: EschortyError | None = None
         steady_timer(self, 0.05, self._watch)
         self._player.start()
+
+    def safe_state(self) -> None:
+        """Stop a replay under way and end its scan."""
+        if self._played.is_set():
+            return
+        if self._failure is None:
+            self.get_logger().warning("interrupted; its scan ends with the points so far")
+        self._closing.set()
+        self._player.join(timeout=5.0)
+        if self._scan_id:
+            self._end.call_async(EndScan.Request(scan_id=self._scan_id))
 
     def destroy_node(self) -> None:
         """Stop the player, then the node."""
@@ -110,6 +127,7 @@ class ReplayNode(Node):
     def _run(self) -> None:
         try:
             self._play()
+            self._played.set()
         except EschortyError as error:
             self._failure = error
         except Exception:
@@ -125,7 +143,7 @@ class ReplayNode(Node):
                 f"recorded with {', '.join(unusual)}; for the same points the reconstruction needs "
                 "these parameters, which replay.launch.py sets"
             )
-        name = f"replay-{Path(self.parameters['recording']).resolve().name}"
+        name = Path(self.parameters["recording"]).resolve().name
         scan, position_mm = self._recording.scan, self._recording.stage_samples["position_mm"]
         start_mm, stop_mm = float(position_mm.min()), float(position_mm.max())
         if scan is not None:
@@ -139,10 +157,12 @@ class ReplayNode(Node):
         self._zero_ns = int(self.get_clock().now().nanoseconds) - begin_us * NS_PER_US
         self._publish_clock()
         self._publish_laser(begin_us, on=not marks["laser_on"].any())
+        # A scan of the same id would be the one that another replay has left open.
+        self._scan_id = f"replay-{name}-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}"
         self._call(
             self._begin,
             BeginScan.Request(
-                scan_id=name,
+                scan_id=self._scan_id,
                 start=m_from_mm(start_mm),
                 stop=m_from_mm(stop_mm),
                 passes=1 if scan is None else scan.passes,
@@ -155,7 +175,8 @@ class ReplayNode(Node):
         self._await_processed(last_us)
         for warning in self._reader.warnings:
             self.get_logger().warning(warning)
-        answer = self._call(self._end, EndScan.Request(scan_id=name))
+        end, self._scan_id = EndScan.Request(scan_id=self._scan_id), ""
+        answer = self._call(self._end, end)
         self.get_logger().info(
             f"{answer.points} points in {answer.profiles} profiles; {answer.message or 'no loss'}"
         )
@@ -243,9 +264,9 @@ class ReplayNode(Node):
         return until_us
 
     def _pace(self, began_s: float, elapsed_s: float, rate: float) -> None:
-        if rate > 0.0:
-            due_s = began_s + elapsed_s / rate
-            self._closing.wait(max(due_s - time.monotonic(), 0.0))
+        wait_s = began_s + elapsed_s / rate - time.monotonic() if rate > 0.0 else 0.0
+        if self._closing.wait(max(wait_s, 0.0)):
+            raise DeviceError("interrupted")
 
     def _publish_rows(self, until_us: int) -> None:
         """Publish the stage rows up to the first one at or after ``until_us``."""
@@ -290,8 +311,9 @@ class ReplayNode(Node):
 
 
 def main() -> int:
-    """Play the recording."""
-    return run(ReplayNode)
+    """Play the recording; return 130 after a signal before its end."""
+    played = threading.Event()
+    return run(partial(ReplayNode, played)) or (0 if played.is_set() else _INTERRUPTED)
 
 
 if __name__ == "__main__":

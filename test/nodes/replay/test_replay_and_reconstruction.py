@@ -145,7 +145,7 @@ def test_state_counts_and_advances(live):
     assert last.points == len(points_from_message(live.topics["scan/points"][-1]))
     until = [ns_from_stamp(state.processed_until) for state in states]
     assert (np.diff(until) >= 0).all()
-    assert any(state.scan_id == "replay-rec" for state in states)
+    assert any(state.scan_id.startswith("replay-rec-") for state in states)
 
 
 def test_frames_form_one_chain(live):
@@ -178,6 +178,21 @@ def test_a_second_replay_as_fast_as_possible_gives_the_same_points(live):
     replay(live.recording, 0.0, live.observer.domain)
     clouds = live.growing["scan/points"]
     wait_until(lambda: len(clouds) > 1, "the second scan")
+    assert_same_points(clouds[-1], live.expected)
+
+
+def test_an_interrupted_replay_ends_its_scan_and_the_next_one_has_all_points(live):
+    clouds, states = live.growing["scan/points"], live.growing["reconstruction/state"]
+    before = len(clouds)
+    parameters = {"recording": live.recording.path, "rate": 0.1, "timeout": DEADLINE_S}
+    with NodeProcess(NODES.format("replay"), parameters, domain=live.observer.domain) as process:
+        wait_until(lambda: states[-1].scan_id, "the scan")
+        assert process.interrupt() == 130
+        assert "interrupted; its scan ends with the points so far" in process.output
+    wait_until(lambda: len(clouds) > before, "the interrupted scan")
+    assert clouds[-1].width < len(live.expected)
+    replay(live.recording, 0.0, live.observer.domain)
+    wait_until(lambda: len(clouds) > before + 1, "the second scan")
     assert_same_points(clouds[-1], live.expected)
 
 
