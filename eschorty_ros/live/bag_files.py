@@ -79,25 +79,33 @@ class BagReader:
         self._chosen: dict[str, Any] = {}
 
     def __enter__(self) -> BagReader:
-        with self._named():
-            self._reader.open()
-            for kind, topic in TOPICS.items():
-                found = [item for item in self._reader.connections if item.msgtype == kind]
-                ours = [item for item in found if item.topic.endswith(topic.split("/", 2)[2])]
-                found = ours or ([] if kind == CLOCK else found)
-                topics = sorted({item.topic for item in found})
-                if len(topics) > 1:
-                    raise FormatError(
-                        f"{self.path} has {kind} on {', '.join(topics)}; leave one of them in it"
-                    )
-                if found and found[0].digest not in ("", self._store.hash_rihs01(kind)):
-                    raise FormatError(
-                        f"{self.path} has another {kind} than this version; convert it with the "
-                        "version that recorded it"
-                    )
-                if found:
-                    self._chosen[kind] = found
+        try:
+            with self._named():
+                self._reader.open()
+                self._choose()
+        except EschortyError:
+            self.__exit__()
+            raise
         return self
+
+    def _choose(self) -> None:
+        for kind, topic in TOPICS.items():
+            found = [item for item in self._reader.connections if item.msgtype == kind]
+            name = topic.removeprefix("/eschorty")
+            ours = [item for item in found if item.topic.endswith(name)]
+            found = ours or ([] if kind == CLOCK else found)
+            topics = sorted({item.topic for item in found})
+            if len(topics) > 1:
+                raise FormatError(
+                    f"{self.path} has {kind} on {', '.join(topics)}; leave one of them in it"
+                )
+            if found and found[0].digest not in ("", self._store.hash_rihs01(kind)):
+                raise FormatError(
+                    f"{self.path} has another {kind} than this version; convert it with the "
+                    "version that recorded it"
+                )
+            if found:
+                self._chosen[kind] = found
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Exception):

@@ -12,7 +12,8 @@ import pytest
 import recorded_scan
 from click.testing import CliRunner
 from recorded_scan import LiveScan
-from rosbags.typesys import get_types_from_msg
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import EschortyError
@@ -140,6 +141,26 @@ def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source
     lacks = bag_to_recording(tmp_path / "twice", tmp_path / "rec")
     assert "packets are not recorded: camera, modulation or settings were changed" in lacks
     np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
+
+
+@pytest.mark.parametrize(
+    ("topics", "chosen"),
+    [
+        (["/mobile_stage/odom", "/stage/odom"], "/stage/odom"),
+        (["/mobile_stage/odom"], "/mobile_stage/odom"),
+        (["/mobile_stage/odom", "/linear/odom"], None),
+    ],
+)
+def test_a_topic_is_ours_by_its_whole_name_or_the_only_one(tmp_path, topics, chosen):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as target:
+        for topic in topics:
+            made = target.add_connection(topic, bag_files.ODOMETRY, typestore=store)
+            if topic == chosen:
+                target.write(made, 1, b"any")
+    two = pytest.raises(EschortyError, match="on /linear/odom, /mobile_stage/odom; leave one")
+    with contextlib.nullcontext() if chosen else two, bag_files.BagReader(tmp_path / "bag") as bag:
+        assert bag_files.ODOMETRY in bag
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", bytes(1000)])
