@@ -84,6 +84,7 @@ class ReplayNode(Node):
         self._end = self.create_client(EndScan, "reconstruction/end_scan")
         self._until_ns = 0
         self._lost = 0
+        self._calibration = ""
         self._advanced_s = time.monotonic()
         self._zero_ns = 0
         self._next_row = 0
@@ -120,7 +121,7 @@ class ReplayNode(Node):
         until_ns = ns_from_stamp(message.processed_until)
         if until_ns != self._until_ns:
             self._until_ns, self._advanced_s = until_ns, time.monotonic()
-        self._lost = message.packets_lost
+        self._lost, self._calibration = message.packets_lost, message.calibration
 
     # The player's thread.
 
@@ -190,10 +191,11 @@ class ReplayNode(Node):
         publishers = (self._events, self._clock_reference, self._laser, self._odom)
         self._advanced_s = time.monotonic()
         self._wait(
-            lambda: (
+            lambda: bool(
                 all(publisher.get_subscription_count() for publisher in publishers)
                 and self._begin.service_is_ready()
                 and self._end.service_is_ready()
+                and self._calibration
             ),
             "no reconstruction subscribes",
         )
@@ -204,6 +206,11 @@ class ReplayNode(Node):
                     f"{name} subscribes to camera/events best effort and may lose packets; make "
                     "its subscription reliable"
                 )
+        if self._calibration != (recorded := self._recording.calibration.name):
+            self.get_logger().warning(
+                f"the recording is of {recorded} and reconstructed with {self._calibration}; check "
+                "that this is its instrument"
+            )
 
     def _publish_clock(self) -> None:
         reference = TimeReference(source="recording")

@@ -1,5 +1,7 @@
 """Recordings replayed to the reconstruction node over real DDS: live topics, scan, refusals."""
 
+import dataclasses
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +15,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from tf2_msgs.msg import TFMessage
 from waiting import DEADLINE_S, wait_until
 
-from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import load_recording
 from eschorty_ros.live.device_messages import ns_from_stamp
@@ -194,6 +196,14 @@ def test_an_interrupted_replay_ends_its_scan_and_the_next_one_has_all_points(liv
     replay(live.recording, 0.0, live.observer.domain)
     wait_until(lambda: len(clouds) > before + 1, "the second scan")
     assert_same_points(clouds[-1], live.expected)
+
+
+def test_another_calibration_than_the_recordings_is_a_warning(live, tmp_path):
+    shutil.copytree(live.recording.path, tmp_path / "rec")
+    other = dataclasses.replace(live.recording.calibration, name="other")
+    save_calibration(other, tmp_path / "rec" / "calibration.yaml")
+    output = replay(load_recording(tmp_path / "rec"), 0.0, live.observer.domain)
+    assert "the recording is of other and reconstructed with config_3; check" in output
 
 
 def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
