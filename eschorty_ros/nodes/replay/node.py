@@ -136,6 +136,10 @@ class ReplayNode(Node):
                 self._failure = DeviceError(traceback.format_exc())
 
     def _play(self) -> None:
+        self._wait(
+            lambda: self.get_clock().now().nanoseconds > 0,
+            "use_sim_time is true and /clock gives no time",
+        )
         self._await_reconstruction()
         usual = Settings()
         recorded = self._recording.settings.items()
@@ -171,13 +175,16 @@ class ReplayNode(Node):
             again=True,
         )
         lost_before = self._lost + int(marks["packets_lost"].sum())
-        last_us = 0 if first is None else self._publish_stream(chain([first], packets))
+        last_us = None if first is None else self._publish_stream(chain([first], packets))
         self._publish_rows(np.iinfo(np.int64).max)
-        self._await_processed(last_us)
+        if last_us is not None:
+            self._await_processed(last_us)
         for warning in self._reader.warnings:
             self.get_logger().warning(warning)
         end, self._scan_id = EndScan.Request(scan_id=self._scan_id), ""
         answer = self._call(self._end, end)
+        if not answer.points:
+            raise DeviceError(answer.message)
         self.get_logger().info(
             f"{answer.points} points in {answer.profiles} profiles; {answer.message or 'no loss'}"
         )

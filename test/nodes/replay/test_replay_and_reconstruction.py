@@ -198,6 +198,23 @@ def test_an_interrupted_replay_ends_its_scan_and_the_next_one_has_all_points(liv
     assert_same_points(clouds[-1], live.expected)
 
 
+def test_without_points_the_reason_ends_the_replay(live, tmp_path):
+    folder = shutil.copytree(live.recording.path, tmp_path / "rec")
+    events = (folder / "events.raw").read_bytes()
+    (folder / "events.raw").write_bytes(events[: events.index(b"% end\n") + 6])
+    parameters, domain = {"recording": folder, "rate": 0.0}, live.observer.domain
+    with NodeProcess(NODES.format("replay"), parameters, domain=domain) as process:
+        assert process.wait() == 1
+        assert "error: no points: no events came; look at the camera" in process.output
+
+
+def test_a_simulated_clock_that_stands_still_is_refused(live):
+    parameters = {"recording": live.recording.path, "use_sim_time": True, "timeout": 0.3}
+    with NodeProcess(NODES.format("replay"), parameters, domain=live.observer.domain) as process:
+        assert process.wait() == 1
+        assert "error: use_sim_time is true and /clock gives no time for 0.3 s" in process.output
+
+
 def test_another_calibration_than_the_recordings_is_a_warning(live, tmp_path):
     shutil.copytree(live.recording.path, tmp_path / "rec")
     other = dataclasses.replace(live.recording.calibration, name="other")
