@@ -32,7 +32,7 @@ from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, stamp_from_ns
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
-from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.spin import run, unless_shut_down
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.nodes.ros.transforms import BASE, OPTICAL, STAGE
 from eschorty_ros.srv import BeginScan, EndScan
@@ -47,6 +47,7 @@ TABLE = (
 _PACKETS_AHEAD = 256
 _ROWS_AHEAD = 1000
 _POLL_S = 0.005
+_STATE_S = 0.5
 _INTERRUPTED = 130
 
 
@@ -89,8 +90,12 @@ class ReplayNode(Node):
         self._zero_ns = 0
         self._next_row = 0
         self._scan_id = ""
+        self._laser_state: LaserState | None = None
+        # A repeated state must not follow the next one.
+        self._laser_lock = threading.Lock()
         self._failure: EschortyError | None = None
         steady_timer(self, 0.05, self._watch)
+        steady_timer(self, _STATE_S, self._repeat_laser)
         self._player.start()
 
     def safe_state(self) -> None:
@@ -116,6 +121,12 @@ class ReplayNode(Node):
             raise self._failure
         if not self._player.is_alive():
             rclpy.shutdown(context=self.context)
+
+    def _repeat_laser(self) -> None:
+        with self._laser_lock, unless_shut_down(self):
+            if self._laser_state is not None:
+                self._laser_state.header.stamp = self.get_clock().now().to_msg()
+                self._laser.publish(self._laser_state)
 
     def _on_state(self, message: ReconstructionState) -> None:
         until_ns = ns_from_stamp(message.processed_until)
@@ -239,7 +250,9 @@ class ReplayNode(Node):
         state.header.stamp = stamp
         if modulation.on_edge_us is not None:
             state.phase_epoch = stamp_from_ns(self._ns(modulation.on_edge_us))
-        self._laser.publish(state)
+        with self._laser_lock:
+            self._laser_state = state
+            self._laser.publish(state)
 
     def _publish_stream(self, packets: Iterable[TimedPacket]) -> int:
         """Publish all packets and the stage rows up to each; return the last sensor time (us)."""

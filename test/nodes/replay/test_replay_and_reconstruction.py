@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import recorded_scan
 from diagnostic_msgs.msg import DiagnosticArray
-from eschorty_ros.msg import ReconstructionState
+from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
 from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import Image, PointCloud2
@@ -184,11 +184,15 @@ def test_a_second_replay_as_fast_as_possible_gives_the_same_points(live):
 
 
 def test_an_interrupted_replay_ends_its_scan_and_the_next_one_has_all_points(live):
-    clouds, states = live.growing["scan/points"], live.growing["reconstruction/state"]
+    """Until then it repeats the laser's state."""
+    clouds = live.growing["scan/points"]
+    states = live.observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
     before = len(clouds)
     parameters = {"recording": live.recording.path, "rate": 0.1, "timeout": DEADLINE_S}
     with NodeProcess(NODES.format("replay"), parameters, domain=live.observer.domain) as process:
-        wait_until(lambda: states[-1].scan_id, "the scan")
+        wait_until(lambda: len(states) > 3, "the laser's state, again")
+        assert len({ns_from_stamp(state.header.stamp) for state in states}) == len(states)
+        assert len({ns_from_stamp(state.output_since) for state in states}) == 1
         assert process.interrupt() == 130
         assert "interrupted; its scan ends with the points so far" in process.output
     wait_until(lambda: len(clouds) > before, "the interrupted scan")
