@@ -18,7 +18,7 @@ from eschorty_ros.core.base.schema import validate
 from eschorty_ros.core.base.yaml_file import Document, parse_yaml
 from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, StageTrack
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.optics import Calibration, refuse_other_sensor
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import Recording, ScanLog
 from eschorty_ros.core.storage.raw_file import RawReader
@@ -165,6 +165,8 @@ def _play(
                 raise FormatError(
                     f"{source.path}: encoding is {short(fields.encoding)}; record evt3"
                 )
+            name = f"a packet of {source.path}"
+            refuse_other_sensor(name, fields.width, fields.height, stream.calibration)
             check_span(fields.events)
             t_ns = ns_from_stamp(fields.header.stamp)
             packet = Packet(int(fields.seq), t_ns, memoryview(fields.events))
@@ -229,6 +231,7 @@ def _write(recording: Recording, target: BagWriter, progress: Progress | None) -
 
     laser(begin_ns, not recording.marks["laser_on"].any())
     reader, row, seq, done = RawReader(recording.events_path), 0, 0, 0
+    width, height = reader.header.named_size
 
     def stage(until_us: int) -> None:
         nonlocal row
@@ -250,7 +253,7 @@ def _write(recording: Recording, target: BagWriter, progress: Progress | None) -
         seq += packet.packets_lost
         target.write(
             EVENTS, t_ns, header={"stamp": stamp(t_ns), "frame_id": "eschorty_optical"},
-            height=reader.header.height, width=reader.header.width, seq=seq, encoding="evt3",
+            height=height, width=width, seq=seq, encoding="evt3",
             events=np.frombuffer(packet.data, np.uint8),
         )  # fmt: skip
         seq += 1

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import EschortyError
-from eschorty_ros.core.optics import save_calibration
+from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import load_recording
 from eschorty_ros.live import bag_files
@@ -141,6 +141,12 @@ def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source
     lacks = bag_to_recording(tmp_path / "twice", tmp_path / "rec")
     assert "packets are not recorded: camera, modulation or settings were changed" in lacks
     np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
+
+
+def test_a_bag_of_a_camera_of_another_size_is_refused(tmp_path, source):
+    recording_to_bag(source, tmp_path / "bag")
+    with pytest.raises(EschortyError, match="of a sensor of 64 x 720 and nominal of one of 1280"):
+        bag_to_recording(tmp_path / "bag", tmp_path / "rec", load_calibration("nominal"))
 
 
 @pytest.mark.parametrize(

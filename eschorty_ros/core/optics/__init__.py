@@ -9,6 +9,7 @@ from eschorty_ros.core.optics.calibration_file import (
     load_calibration,
     load_named_calibration,
     refuse_other_instrument,
+    refuse_other_sensor,
     save_calibration,
     save_named_calibration,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "load_named_calibration",
     "photons_per_column",
     "refuse_other_instrument",
+    "refuse_other_sensor",
     "save_calibration",
     "save_named_calibration",
 ]

@@ -295,6 +295,19 @@ def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None
             )
 
 
+def refuse_other_sensor(events: str, width: int, height: int, calibration: Calibration) -> None:
+    """Refuse events of a sensor of another size than the calibration's; 0 x 0 is unknown.
+
+    Raises ``CalibrationError``, which names the ``events`` and both sizes.
+    """
+    size = width, height
+    if size not in ((0, 0), (calibration.columns, calibration.rows)):
+        raise CalibrationError(
+            f"{events} is of a sensor of {width} x {height} and {calibration.name} of one of "
+            f"{calibration.columns} x {calibration.rows}; give the calibration of this camera"
+        )
+
+
 def _may_be_shipped(text: str) -> bool:
     return re.fullmatch(r"[A-Za-z0-9_-]{1,100}", text) is not None
 

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.optics import refuse_other_sensor
 from eschorty_ros.core.reconstruction.clock_wraps import in_wrap
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import (
-    check_sensor,
     recording_warnings,
     shown_frequency_hz,
 )
@@ -89,13 +89,14 @@ def reconstruct_recording(
     """
     began = time.perf_counter()
     settings = settings or recorded_settings(recording)
-    check_sensor(recording)
+    reader = RawReader(recording.events_path)
+    name, build = recording.events_path.name, recording.calibration
+    refuse_other_sensor(name, *reader.header.named_size, build)
     recording, wrapped = in_wrap(recording)
     settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
     jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
-    reader = RawReader(recording.events_path)
     done = 0
     with ExitStack() as files, ThreadPoolExecutor(1) as beside:
         shown = beside.submit(shown_frequency_hz, recording) if jobs > 1 else None

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from eschorty_ros.core.base.errors import CalibrationError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -174,18 +173,6 @@ def without_modulation(events: int, frequency_hz: float) -> str:
         f"hardly any of {events:,} events follow the laser's modulation at {frequency_hz:g} Hz; "
         "look at its frequency, at the focus and at what the line falls on"
     )
-
-
-def check_sensor(recording: Recording) -> None:
-    """Raise ``CalibrationError`` when the calibration is of another sensor than the events."""
-    header, build = RawReader(recording.events_path).header, recording.calibration
-    named = "geometry" in header or "width=" in header.get("format", "")
-    if named and (header.width, header.height) != (build.columns, build.rows):
-        raise CalibrationError(
-            f"{recording.events_path.name} is of a sensor of {header.width} x {header.height} and "
-            f"{build.name} of one of {build.columns} x {build.rows}; give the calibration of this "
-            "camera"
-        )
 
 
 def _few_points(

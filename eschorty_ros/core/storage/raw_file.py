@@ -39,6 +39,12 @@ class Header(Mapping[str, str]):
         self.height = height
         self.size_bytes = size_bytes
 
+    @property
+    def named_size(self) -> tuple[int, int]:
+        """Width and height that the file names, zeros when it names none."""
+        named = "geometry" in self or "width=" in self.get("format", "")
+        return (self.width, self.height) if named else (0, 0)
+
     def __getitem__(self, key: str) -> str:
         return self._values[key]
 

@@ -6,30 +6,34 @@ import struct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.optics import Calibration, refuse_other_sensor
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.nodes.ros.conversions import NS_PER_S
 
 _PACKET_MAX_BYTES = 16_000_000
 # A serialized message begins with its encoding; its numbers are aligned to what follows.
 _LITTLE_ENDIAN, _BODY_AT = b"\0\1", 4
-# Seconds, nanoseconds and the size of the frame's text; seq, time_base and the size of encoding.
-_STAMP, _NUMBERS, _SIZE = struct.Struct("<iII"), struct.Struct("<QQI"), struct.Struct("<I")
+# Seconds, nanoseconds and the size of the frame's text; height and width; seq, time_base and the
+# size of encoding.
+_STAMP, _SENSOR = struct.Struct("<iII"), struct.Struct("<II")
+_NUMBERS, _SIZE = struct.Struct("<QQI"), struct.Struct("<I")
 
 
-def packet_from_message(message: bytes, source: bytes) -> Packet:
+def packet_from_message(message: bytes, source: bytes, calibration: Calibration) -> Packet:
     """Return the packet of a serialized ``EventPacket``, with a view of the events in it.
 
     To make an object of the message costs as much as some thousand events.
 
     Raises ``ArgumentError`` when it cannot be read, has another encoding or more bytes than a
-    packet may have.
+    packet may have, and ``CalibrationError`` when it is of a sensor of another size.
     """
     if message[:2] != _LITTLE_ENDIAN:
         raise ArgumentError("a packet is not serialized in little-endian order; send it so")
     try:
         sec, nanosec, frame = _STAMP.unpack_from(message, _BODY_AT)
-        # Of the frame's text, height and width.
-        at = _aligned(_aligned(_BODY_AT + _STAMP.size + frame, 4) + 8, 8)
+        at = _aligned(_BODY_AT + _STAMP.size + frame, 4)
+        height, width = _SENSOR.unpack_from(message, at)
+        at = _aligned(at + _SENSOR.size, 8)
         seq, _, text = _NUMBERS.unpack_from(message, at)
         at += _NUMBERS.size
         encoding = message[at : at + text].rstrip(b"\0").decode()
@@ -40,6 +44,7 @@ def packet_from_message(message: bytes, source: bytes) -> Packet:
         raise ArgumentError(f"a packet cannot be read: {error}") from error
     if encoding != "evt3":
         raise ArgumentError(f"encoding is {short(encoding)}; set the camera to evt3")
+    refuse_other_sensor("a packet", width, height, calibration)
     if size > _PACKET_MAX_BYTES:
         raise ArgumentError(
             f"a packet has {size} bytes; send {_PACKET_MAX_BYTES} at most, at a lower threshold"

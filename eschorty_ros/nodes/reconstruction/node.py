@@ -203,7 +203,7 @@ class ReconstructionNode(Node):
     # Callbacks: queue and return.
 
     def _on_packet(self, message: bytes, info: Mapping[str, Any]) -> None:
-        packet = packet_from_message(message, self._camera.check(info))
+        packet = packet_from_message(message, self._camera.check(info), self.calibration)
         self._reports.packet_ages.add(age_s(self, info, packet.stamp_ns))
         self._jobs.post_bulk(partial(self._add_packet, packet))
 

@@ -258,6 +258,7 @@ class ReplayNode(Node):
         """Publish all packets and the stage rows up to each; return the last sensor time (us)."""
         rate = self.parameters["rate"]
         rows_us = self._recording.stage_samples["t_us"]
+        width, height = self._reader.header.named_size
         pending: list[int] = []
         began_s = time.monotonic()
         first_us: int | None = None
@@ -270,12 +271,7 @@ class ReplayNode(Node):
             if packet.laser_on:
                 self._publish_laser(packet.from_us, on=True)
             seq += packet.packets_lost
-            message = EventPacket(
-                height=self._reader.header.height,
-                width=self._reader.header.width,
-                seq=seq,
-                encoding="evt3",
-            )
+            message = EventPacket(height=height, width=width, seq=seq, encoding="evt3")
             message.events.frombytes(packet.data)
             message.header.stamp = stamp_from_ns(self._ns(packet.from_us))
             message.header.frame_id = OPTICAL
