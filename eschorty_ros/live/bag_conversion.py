@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,8 @@ from eschorty_ros.live.scan_recorder import ScanRecorder
 
 _SCAN, _SETTINGS = "eschorty_scan", "eschorty_settings"
 _DISK_S = 600.0
+# Packets of which one has a larger seq than the first; two may have changed places.
+_NUMBERS = 20
 
 
 def bag_to_recording(
@@ -85,19 +89,21 @@ def bag_to_recording(
             stream.set_laser(Modulation(frequency_hz), None)
         kinds = (CLOCK, TRIGGER, *([LASER] if frequency_hz is None else []))
         _latched(source, stream, kinds)
-        recorder = ScanRecorder(file_path("folder", folder), log, build, chosen, waits=True)
+        target = file_path("folder", folder)
+        recorder = ScanRecorder(target, log, build, chosen, waits=True)
         if fault := recorder.made(_DISK_S):
             raise ArgumentError(fault)
         stream.begin_scan(recorder)
         try:
             _play(source, stream, recorder, kinds)
+            if not stream.packets:
+                raise FormatError(f"{path} has no packet with a laser state; give --frequency")
         except BaseException:
-            recorder.end(None, "the bag was not read to its end")
+            recorder.end(None)
             recorder.wait(_DISK_S)
+            # Half a recording would look complete.
+            shutil.rmtree(target, ignore_errors=True)
             raise
-    if not stream.packets:
-        recorder.end(None)
-        raise FormatError(f"{path} has no packet with a laser state; give --frequency")
     recorder.end(None)
     return recorder.wait(_DISK_S)
 
@@ -112,6 +118,13 @@ def _check(source: BagReader, calibration: Calibration | None, frequency_hz: flo
     ):  # fmt: skip
         if missing and kind not in source:
             raise FormatError(f"{source.path} has no {kind}; {remedy}")
+    first = islice(source.messages(EVENTS), _NUMBERS)
+    numbers = [message.fields.seq for message in first]
+    if len(numbers) > 1 and max(numbers) == numbers[0]:
+        raise FormatError(
+            f"{source.path}: seq of the event packets does not increase from {numbers[0]} on; "
+            "let the camera's driver count them"
+        )
 
 
 def _from_custom(path: Path, custom: dict[str, str], key: str) -> Document:

@@ -45,6 +45,12 @@ def points(recording):
     return reconstruct_recording(recording).points
 
 
+def bag_messages(recording, bag):
+    recording_to_bag(recording, bag)
+    with bag_files.BagReader(bag) as written:
+        return list(written.messages(*bag_files.TOPICS))
+
+
 def write_messages(bag, messages, custom):
     with bag_files.BagWriter(bag, "mcap", custom) as target:
         for message in messages:
@@ -117,18 +123,14 @@ def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path
     ],
 )
 def test_wrong_metadata_of_a_bag_is_one_line(tmp_path, source, key, text, words):
-    recording_to_bag(source, tmp_path / "bag")
-    with bag_files.BagReader(tmp_path / "bag") as bag:
-        messages = list(bag.messages(*bag_files.TOPICS))
+    messages = bag_messages(source, tmp_path / "bag")
     write_messages(tmp_path / "wrong", messages, {key: text})
     with pytest.raises(EschortyError, match=words):
         bag_to_recording(tmp_path / "wrong", tmp_path / "rec")
 
 
 def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source):
-    recording_to_bag(source, tmp_path / "bag")
-    with bag_files.BagReader(tmp_path / "bag") as bag:
-        messages = list(bag.messages(*bag_files.TOPICS))
+    messages = bag_messages(source, tmp_path / "bag")
     bag_to_recording(tmp_path / "bag", tmp_path / "once")
     expected = points(load_recording(tmp_path / "once"))
     for message in list(messages):
@@ -141,6 +143,26 @@ def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source
     lacks = bag_to_recording(tmp_path / "twice", tmp_path / "rec")
     assert "packets are not recorded: camera, modulation or settings were changed" in lacks
     np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
+
+
+def test_packets_that_the_driver_does_not_number_are_refused(tmp_path, source):
+    messages = bag_messages(source, tmp_path / "bag")
+    for message in messages:
+        if message.kind == bag_files.EVENTS:
+            message.fields.seq = 0
+    write_messages(tmp_path / "same", messages, {})
+    with pytest.raises(EschortyError, match="seq of the event packets does not increase from 0"):
+        bag_to_recording(tmp_path / "same", tmp_path / "rec")
+
+
+def test_a_conversion_that_fails_leaves_no_recording(tmp_path, source):
+    messages = bag_messages(source, tmp_path / "bag")
+    last = next(m for m in reversed(messages) if m.kind == bag_files.EVENTS)
+    last.fields.encoding = "evt2"
+    write_messages(tmp_path / "wrong", messages, {})
+    with pytest.raises(EschortyError, match="encoding is 'evt2'"):
+        bag_to_recording(tmp_path / "wrong", tmp_path / "rec")
+    assert not (tmp_path / "rec").exists()
 
 
 def test_a_bag_of_a_camera_of_another_size_is_refused(tmp_path, source):
