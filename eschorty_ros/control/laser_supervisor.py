@@ -106,6 +106,13 @@ class LaserSupervisor:
         """Disable and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
         for watchdog in self._watchdogs:
             watchdog.stop()
+        try:
+            self._release()
+        finally:
+            for watchdog in self._watchdogs:
+                watchdog.join()
+
+    def _release(self) -> None:
         with self._in_flight.disabling("closed"), self._locked():
             laser, self._laser = self._laser, None
             if laser is None:
@@ -375,9 +382,12 @@ class _Watchdog:
         self._thread.start()
 
     def stop(self) -> None:
-        """Begin no further check; wait up to 1 s for one in progress."""
+        """Begin no further check."""
         self._stopped = True
         self.wake()
+
+    def join(self) -> None:
+        """Wait up to 1 s for a check in progress."""
         if self._thread is not threading.current_thread():
             self._thread.join(_STOP_TIMEOUT_S)
 

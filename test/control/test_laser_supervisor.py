@@ -9,6 +9,7 @@ from delayed_laser import DelayedLaser
 from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
+from eschorty_ros.control import laser_supervisor
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT, LaserInterlock
 from eschorty_ros.control.laser_readback import LaserStatus
 from eschorty_ros.control.laser_supervisor import LaserSupervisor
@@ -204,6 +205,21 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(superv
     enabling.join()
     assert failures == ["switched off meanwhile"]
     assert supervisor.status().reason == "interlock open"
+
+
+def test_closing_disables_before_it_waits_for_a_check(laser, monkeypatch):
+    monkeypatch.setattr(laser_supervisor, "_STOP_TIMEOUT_S", 10.0 * DEADLINE_S)
+    supervisor = opened(laser, LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}))
+    supervisor.arm()
+    supervisor.enable()
+    laser.delayed = "readback"
+    assert laser.reached.wait(DEADLINE_S)
+    closing = in_thread(supervisor.close, [])
+    # Sooner than the read-back, too, would give up.
+    assert laser.disabled.wait(DEADLINE_S / 2)
+    assert not laser.lit
+    laser.go.set()
+    closing.join()
 
 
 def test_stall_of_this_process_leaves_light_on(monkeypatch):
