@@ -42,6 +42,7 @@ def command(path: Path) -> None:
     from eschorty_ros.core.storage import (
         LASER_FILE,
         TRUTH_FILE,
+        is_cloud,
         load_recording,
         read_laser_yaml,
         read_stage_csv,
@@ -70,7 +71,7 @@ def command(path: Path) -> None:
         span_us = _raw(recording.events_path)
         for fault in stage_faults(recording, span_us) if span_us else []:
             warn(fault)
-    elif path.suffix in (".pcd", ".ply"):
+    elif is_cloud(path):
         _cloud(path)
     elif path.name == LASER_FILE:
         pairs(str(path), _laser(read_laser_yaml(path)))
@@ -82,11 +83,11 @@ def command(path: Path) -> None:
         marks = read_marks_csv(path)
         pairs(str(path), {"packets lost": f"{marks['packets_lost'].sum():,}",
                           "laser switched on": f"{marks['laser_on'].sum():,} times"})  # fmt: skip
-    elif path.suffix in (".yaml", ".yml"):
+    elif path.suffix.lower() in (".yaml", ".yml"):
         pairs(str(path), _calibration(load_calibration(path)))
     elif path.name == TRUTH_FILE:
         pairs(str(path), _truth(read_truth_csv(path)))
-    elif path.suffix == ".csv":
+    elif path.suffix.lower() == ".csv":
         pairs(str(path), _stage(read_stage_csv(path)))
     else:
         _raw(path)

@@ -127,7 +127,7 @@ def command(
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
       eschorty reconstruct monday/* --dask tcp://host:8786
     """  # noqa: D301
-    from eschorty_ros.core.storage import RAW_ALONE
+    from eschorty_ros.core.storage import RAW_ALONE, is_cloud
     from eschorty_ros.live.bag_files import is_bag
 
     several = len(recordings) > 1
@@ -145,7 +145,7 @@ def command(
     if several and len(set(targets)) < len(targets):
         twice = next(target for target in targets if targets.count(target) > 1)
         raise click.UsageError(f"two recordings would be written to {twice}; give them one by one")
-    if targets[0].suffix not in (".pcd", ".ply"):
+    if not is_cloud(targets[0]):
         raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
     task = partial(
         reconstruct_to,

@@ -14,8 +14,11 @@ from typing import Any
 import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.storage import EVENTS_FILE
 
 STORAGES = ("mcap", "sqlite3")
+_METADATA, _COMPRESSED = "metadata.yaml", ".zstd"
+_ENDINGS = tuple(f"{name}{end}" for name in (".mcap", ".db3") for end in ("", _COMPRESSED))
 
 EVENTS = "event_camera_msgs/msg/EventPacket"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -61,7 +64,29 @@ class BagMessage:
 
 def is_bag(path: Path) -> bool:
     """Return whether a path is that of a bag: its folder or one file of it."""
-    return (path / "metadata.yaml").is_file() or path.suffix in (".mcap", ".db3")
+    if path.is_dir():
+        files = [] if (path / EVENTS_FILE).is_file() else _files_in(path)
+        return (path / _METADATA).is_file() or bool(files)
+    return path.name.lower().endswith(_ENDINGS)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return [file for file in sorted(folder.iterdir()) if file.is_file() and is_bag(file)]
+
+
+def _to_open(path: Path) -> Path:
+    """Return the folder of a bag, or its only file; a killed recorder writes no metadata."""
+    if path.is_dir() and not (path / _METADATA).is_file():
+        files = _files_in(path)
+        if len(files) > 1:
+            raise FormatError(
+                f"{path} has {len(files)} files of bags and no {_METADATA}; give one of them, or "
+                "run `ros2 bag reindex`"
+            )
+        path = files[0] if files else path
+    if path.suffix.lower() == _COMPRESSED:
+        raise FormatError(f"{path} is compressed; run unzstd on it")
+    return path
 
 
 class BagReader:
@@ -75,7 +100,7 @@ class BagReader:
         # The definitions in a bag are not used: the library cannot parse every one of ROS's own.
         self._store = _store()
         with self._named():
-            self._reader = _rosbags("rosbag2").Reader(path)
+            self._reader = _rosbags("rosbag2").Reader(_to_open(path))
         self._chosen: dict[str, Any] = {}
 
     def __enter__(self) -> BagReader:
@@ -143,8 +168,8 @@ class BagReader:
             raise
         except Exception as error:
             raise FormatError(
-                f"cannot read the bag {self.path}: {error or type(error).__name__}; record it "
-                "again, or repair it with `ros2 bag reindex`"
+                f"cannot read the bag {self.path}: {error or type(error).__name__}; repair it: a "
+                f"cut .mcap with `mcap recover`, its {_METADATA} with `ros2 bag reindex`"
             ) from error
 
 

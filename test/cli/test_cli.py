@@ -314,7 +314,7 @@ def test_info_reads_every_file_of_a_recording(recording, name, words):
 
 
 def test_info_gives_the_bounds_of_a_cloud(cloud):
-    output = good("info", cloud)
+    output = good("info", cloud.rename(cloud.with_suffix(".PCD")))
     assert "1320.000 to 1320.000 mm" in output
     assert "0.700 mm" in output
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import shutil
 import sqlite3
 from copy import deepcopy
 from dataclasses import replace
@@ -191,11 +192,31 @@ def test_a_topic_is_ours_by_its_whole_name_or_the_only_one(tmp_path, topics, cho
         assert bag_files.ODOMETRY in bag
 
 
+def test_a_bag_without_its_metadata_is_read_where_it_is_one_file(tmp_path, source):
+    messages = bag_messages(source, tmp_path / "bag")
+    [file] = (tmp_path / "bag").glob("*.mcap")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    assert bag_files.is_bag(tmp_path / "bag")
+    with bag_files.BagReader(tmp_path / "bag") as bag:
+        assert len(list(bag.messages(*bag_files.TOPICS))) == len(messages)
+    second = file.rename(file.with_name("b.mcap.zstd"))
+    for path, words in ((second, "run unzstd on it"), (tmp_path / "bag", "2 files of bags and no")):
+        with pytest.raises(EschortyError, match=words):
+            bag_files.BagReader(path)
+        file.write_bytes(b"")
+
+
+def test_the_name_of_a_recordings_folder_makes_it_no_bag(tmp_path, source):
+    folder = shutil.copytree(source.path, tmp_path / "rec.mcap")
+    (folder / "scan.mcap").touch()
+    assert not bag_files.is_bag(folder)
+
+
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", bytes(1000)])
 def test_a_damaged_bag_is_one_line(tmp_path, content):
     for name in ("bag.mcap", "bag.db3"):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(EschortyError, match=name):
+        with pytest.raises(EschortyError, match=f"{name}: .*; repair it: a cut .mcap with `mcap"):
             bag_to_recording(tmp_path / name, tmp_path / "rec")
 
 

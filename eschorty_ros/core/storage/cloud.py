@@ -205,13 +205,17 @@ def _widened(points: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     return wide
 
 
+def is_cloud(path: Path) -> bool:
+    """Return whether the name of a file is that of a cloud."""
+    return path.suffix.lower() in (".pcd", ".ply")
+
+
 def _header_writer(path: Path) -> Any:
-    try:
-        return {".pcd": _pcd_header, ".ply": _ply_header}[path.suffix.lower()]
-    except KeyError:
+    if not is_cloud(path):
         raise ArgumentError(
             f"{path} ends in {path.suffix!r}; choose a name that ends in .pcd or .ply"
-        ) from None
+        )
+    return _pcd_header if path.suffix.lower() == ".pcd" else _ply_header
 
 
 def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
