@@ -214,9 +214,9 @@ def _raw(path: Path) -> tuple[int, int] | None:
         "triggers": f"{triggers:,} ({rising:,} rising)",
     }
     rows |= {
-        name.replace("_", " "): f"{value:,}"
+        label: f"{value:,}"
         for name, value in asdict(decoder.counters).items()
-        if name != "events" and value
+        if value and (label := name.replace("_", " ")) not in rows
     }
     pairs(str(path), rows)
     for warning in reader.warnings:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from numba.core.event import install_recorder
+from streams import words_of
 from waiting import wait_until
 
 from eschorty_ros import __version__
@@ -280,6 +281,13 @@ def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     for words in ("config_3", "70 Hz", "ranges", "events/s", "1280 x 720"):
         assert words in output
     assert "peak rate" in good("info", recording / "events.raw")
+
+
+def test_info_counts_the_rising_edges_of_the_trigger_input(tmp_path):
+    file = tmp_path / "events.raw"
+    words = words_of("8000 6064 002A A001 A000 A001")
+    file.write_bytes(b"% evt 3.0\n% geometry 1280x720\n% end\n" + words)
+    assert "3 (2 rising)" in good("info", file)
 
 
 def test_info_warns_of_a_recording_that_is_cut(recording, tmp_path):
