@@ -156,7 +156,7 @@ class RawReader:
         if not values and not ended and not head.startswith(b"% "):
             if head.startswith(_GZIP):
                 raise FormatError(f"{self.path} is compressed with gzip; run gunzip on it")
-            if not self._looks_like_evt3(head):
+            if not self._looks_like_evt3(head, 0):
                 raise FormatError(
                     f"{self.path} has no RAW header (first bytes {head[:8].hex(' ')}); "
                     "name a Prophesee RAW file"
@@ -164,13 +164,18 @@ class RawReader:
             self._warn("has no header; taken as EVT3, 1280x720")
         elif not ended:
             self._warn("has no '% end'; its header is taken to stop where the '% ' lines do")
+        stated = "format" in values or "evt" in values
+        if not stated and self.size_bytes > at and not self._looks_like_evt3(head, at):
+            raise FormatError(
+                f"{self.path} names no format and its words are not EVT3's; convert it to EVT3"
+            )
         width, height = self._meaning(values)
         return Header(values, width, height, at)
 
     @staticmethod
-    def _looks_like_evt3(head: bytes) -> bool:
-        """Return whether a file without header begins with EVT3 words, TIME_HIGH among them."""
-        kinds = [byte >> 4 for byte in head[1:4096:2]]
+    def _looks_like_evt3(head: bytes, at: int) -> bool:
+        """Return whether a file has EVT3 words from ``at`` on, TIME_HIGH among them."""
+        kinds = [byte >> 4 for byte in head[at + 1 : at + 4096 : 2]]
         return w3.TIME_HIGH in kinds and not any(kind in w3.UNUSED for kind in kinds)
 
     def _meaning(self, values: dict[str, str]) -> tuple[int, int]:
@@ -184,7 +189,7 @@ class RawReader:
                 f"{self.path} has format {name} and evt {version}; correct one of the two"
             )
         sizes = []
-        option = dict(part.split("=", 1) for part in options if "=" in part)
+        option = dict(part.strip().split("=", 1) for part in options if "=" in part)
         if "width" in option or "height" in option:
             sizes.append(self._size(f"{option.get('width')}x{option.get('height')}", "format"))
         if "geometry" in values:

@@ -35,6 +35,12 @@ def test_old_header_without_end(tmp_path: Path) -> None:
     assert said == [(True, False), (False, True)]
 
 
+def test_blanks_between_the_parts_of_the_format(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, b"% format EVT3; height=480; width=640\n% end\n" + WORDS)
+    assert reader.header.named_size == (640, 480)
+    assert reader.warnings == []
+
+
 def test_words_that_look_like_a_header_line(tmp_path: Path) -> None:
     data = b"% looks like a line\n"
     assert b"".join(reader_of(tmp_path, NEW + data)) == data
@@ -75,6 +81,7 @@ def test_a_header_or_events_alone_are_a_warning(tmp_path: Path, content: bytes, 
         (b"", "empty"),
         (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "no RAW header"),
         (b"\x1f\x8b" + bytes(99), "gzip; run gunzip on it"),
+        (b"% Data file containing CD events.\n% Version 2\n" + bytes(range(256)), "not EVT3's"),
         (b"% evt 2.0\n% end\n", "EVT2, not EVT3"),
         (b"% evt 2.1\n% end\n", "EVT21, not EVT3"),
         (b"% format EVT21;height=720;width=1280\n% end\n", "EVT21, not EVT3"),
