@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,7 +69,8 @@ def command(path: Path) -> None:
         if recording.scan is not None:
             rows |= _scan(recording.scan)
         pairs(str(path), rows | _truth(recording.truth))
-        span_us = _raw(recording.events_path)
+        gaps = int((recording.marks["packets_lost"] > 0).sum())
+        span_us = _raw(recording.events_path, gaps)
         for fault in stage_faults(recording, span_us) if span_us else []:
             warn(fault)
     elif is_cloud(path):
@@ -169,11 +171,15 @@ def _cloud(path: Path) -> None:
     pairs(str(path), rows)
 
 
-def _raw(path: Path) -> tuple[int, int] | None:
-    """Show a file of the camera's bytes; return the sensor times of its first and last event."""
+def _raw(path: Path, gaps: int = 0) -> tuple[int, int] | None:
+    """Show a file of the camera's bytes; return the sensor times of its first and last event.
+
+    ``gaps`` is the number of places where packets are known to be missing.
+    """
     import numpy as np
 
     from eschorty_ros.core.evt3 import Decoder
+    from eschorty_ros.core.reconstruction.stream_faults import decoder_counts, stream_faults
     from eschorty_ros.core.storage.raw_file import RawReader
 
     reader = RawReader(path)
@@ -219,6 +225,8 @@ def _raw(path: Path) -> tuple[int, int] | None:
         if value and (label := name.replace("_", " ")) not in rows
     }
     pairs(str(path), rows)
-    for warning in reader.warnings:
+    known = Counter(events=events, decoder_gaps=gaps)
+    faults = stream_faults(decoder_counts(decoder.counters) + known)
+    for warning in [*reader.warnings, *faults]:
         warn(warning)
     return (first_us, last_us) if events else None

@@ -290,6 +290,14 @@ def test_info_counts_the_rising_edges_of_the_trigger_input(tmp_path):
     assert "3 (2 rising)" in good("info", file)
 
 
+def test_info_warns_of_bytes_that_are_no_events(tmp_path):
+    file, noise = tmp_path / "events.raw", np.random.default_rng(3).bytes(20_000)
+    file.write_bytes(b"% evt 3.0\n% geometry 1280x720\n% end\n" + noise)
+    done = run("info", file)
+    assert done.exit_code == 0
+    assert "words of the events are not as EVT3 has them" in done.stderr
+
+
 def test_info_warns_of_a_recording_that_is_cut(recording, tmp_path):
     shutil.copytree(recording, tmp_path / "rec")
     data = (recording / "events.raw").read_bytes()

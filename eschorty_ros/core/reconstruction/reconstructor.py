@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,11 @@ from eschorty_ros.core.reconstruction.readout_window import window_model, window
 from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
-from eschorty_ros.core.reconstruction.stream_faults import is_unreadable, stream_faults
+from eschorty_ros.core.reconstruction.stream_faults import (
+    decoder_counts,
+    is_unreadable,
+    stream_faults,
+)
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 from eschorty_ros.core.storage import SENSOR_EDGE
 
@@ -394,8 +398,5 @@ class Reconstructor:
         counts["events_dropped"] = sum(
             counts[f"events_{reason}"] for reason in ("over_column_limit", "outside_sensor")
         )
-        decoder = self._decoder.counters
-        counts["sensor_drop_words"] = decoder.sensor_drop_words
-        counts["broken_words"] = decoder.broken_words
-        counts.update({f"decoder_{k}": int(v) for k, v in asdict(decoder).items()})
+        counts.update(decoder_counts(self._decoder.counters))
         return dict(counts)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import asdict
+
+from eschorty_ros.core.evt3 import Counters
 
 # Chance gives up to 0.18 of the points of short streams a shift.
 _BURST_SHIFT_SHARE = 0.22
@@ -13,6 +17,14 @@ _FEWER_EVENTS = (
     "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
     "bias_diff_off)"
 )
+
+
+def decoder_counts(decoder: Counters) -> Counter[str]:
+    """Return the counts of a decoder by the names that a `Reconstructor` gives them."""
+    counts = Counter({f"decoder_{name}": int(n) for name, n in asdict(decoder).items()})
+    counts["sensor_drop_words"] = decoder.sensor_drop_words
+    counts["broken_words"] = decoder.broken_words
+    return counts
 
 
 def is_unreadable(counts: Mapping[str, int]) -> bool:
