@@ -30,6 +30,8 @@ _LEFT_SHARE = 0.02
 _LEFT_US = 100_000
 # Speed of a jump, mm/s and over that of the sweep.
 _FAST_MM_S, _JUMP = 1000.0, 10.0
+# Times that the stage's log may be longer than the events.
+_OTHER_UNIT = 100
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 _LOSSES = {
@@ -143,6 +145,13 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
     begin_us, end_us = span_us
     if t_us[0] > end_us or t_us[-1] < begin_us:
         # Another line says that they do not overlap.
+        return found
+    logged_us, events_us = int(t_us[-1] - t_us[0]), end_us - begin_us
+    if logged_us > _OTHER_UNIT * events_us:
+        found.append(
+            f"stage.csv covers {logged_us * 1e-6:.3g} s and the events {events_us * 1e-6:.3g} s; "
+            f"where t_us is in nanoseconds, write microseconds, else copy {name} again"
+        )
         return found
     after = position_mm[np.searchsorted(t_us, end_us + _LEFT_US) :]
     if after.size and np.ptp(after) > least_mm:
