@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
@@ -30,6 +31,8 @@ _LEFT_SHARE = 0.02
 _LEFT_US = 100_000
 # Speed of a jump, mm/s and over that of the sweep.
 _FAST_MM_S, _JUMP = 1000.0, 10.0
+# Both steps of a sample that leaves and returns, over those of the sweep.
+_RETURN = 4.0
 # Times that the stage's log may be longer than the events.
 _OTHER_UNIT = 100
 # Difference of a multiple of the frequency from a whole one.
@@ -134,9 +137,8 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"the stage stays at {position_mm[0]:.6g} mm in stage.csv: all profiles are in one "
             "place; where it moved, give its positions"
         )
-    speed_mm_s = np.abs(np.diff(position_mm)) / np.diff(t_us) * 1e6
-    jump = int(np.argmax(speed_mm_s)) if t_us.size > 1 else 0
-    if t_us.size > 1 and speed_mm_s[jump] > max(_JUMP * np.quantile(speed_mm_s, 0.9), _FAST_MM_S):
+    jump = _jump(t_us, position_mm)
+    if jump is not None:
         found.append(
             f"the stage jumps from {position_mm[jump]:.6g} to {position_mm[jump + 1]:.6g} mm at "
             f"{t_us[jump + 1] * 1e-6:.3f} s in stage.csv; remove the sample that is wrong"
@@ -172,6 +174,25 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"{name} is missing: copy it again"
         )
     return found
+
+
+def _jump(t_us: NDArray[np.int64], position_mm: NDArray[np.float64]) -> int | None:
+    """Return the index before a wrong sample: one that is too fast, or leaves and returns."""
+    if t_us.size < 2:
+        return None
+    steps_mm = np.diff(position_mm)
+    sizes_mm = np.abs(steps_mm)
+    speed_mm_s = sizes_mm / np.diff(t_us) * 1e6
+    jump = int(np.argmax(speed_mm_s))
+    if speed_mm_s[jump] > max(_JUMP * np.quantile(speed_mm_s, 0.9), _FAST_MM_S):
+        return jump
+    returns = steps_mm[:-1] * steps_mm[1:] < 0.0
+    back_mm = np.minimum(sizes_mm[:-1], sizes_mm[1:])[returns]
+    # Rest must not make the turn of a sweep look fast.
+    moving_mm = sizes_mm[sizes_mm > _REST_MM]
+    if back_mm.size and moving_mm.size and back_mm.max() > _RETURN * np.quantile(moving_mm, 0.9):
+        return int(np.flatnonzero(returns)[np.argmax(back_mm)])
+    return None
 
 
 def without_modulation(events: int, frequency_hz: float) -> str:

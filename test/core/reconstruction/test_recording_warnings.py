@@ -11,6 +11,7 @@ from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
 from eschorty_ros.core.storage import ScanLog, load_recording
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
@@ -138,6 +139,7 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
         (lambda r: with_half_of_the_events(r, 1), {}, "mm before; where these were scanned", 1),
         (lambda r: with_stage_at(r, 20.0), {}, "the stage stays at 20 mm in stage.csv", 1),
         (lambda r: with_stage_at(r, 180.0, 40), {}, "to 180 mm at 0.400 s in stage.csv; remove", 1),
+        (lambda r: with_stage_at(r, 29.0, 40), {}, "to 29 mm at 0.400 s in stage.csv; remove", 1),
         (lambda r: r.corrected(replace(NARROW, name="other")), {}, "of config_3 and reconstr", 1),
         # In another wrap of the camera's clock, and in the host's time.
         (lambda r: with_stage(r, (4 << 24) + 6_000_000), {}, "have no stage position; give the", 0),
@@ -155,6 +157,30 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
     result = reconstruct_recording(change(recording), Settings(**settings))
     assert (len(result.points) > 0) == points
     assert sum(words in line for line in result.warnings) == 1, result.warnings
+
+
+FORTH_MM = np.linspace(10.0, 40.0, 60)
+SWEEP_MM = np.concatenate([np.full(600, 10.0), FORTH_MM, FORTH_MM[::-1]])
+NOISE_MM = np.random.default_rng(1).normal(0.0, 1.0, SWEEP_MM.size)
+
+
+@pytest.mark.parametrize(
+    "position_mm",
+    [
+        SWEEP_MM,
+        SWEEP_MM + 0.1 * NOISE_MM,
+        np.round(SWEEP_MM + 0.05 * NOISE_MM),
+        10.0 + 0.001 * NOISE_MM,
+        10.0 + 0.01 * NOISE_MM,
+        np.full(SWEEP_MM.size, 10.0),
+    ],
+    ids=["sweep", "noise", "steps of 1 mm", "rest", "rest with noise", "same"],
+)
+def test_a_stage_that_rests_turns_or_is_coarse_does_not_jump(recording, position_mm):
+    samples = np.empty(position_mm.size, recording.stage_samples.dtype)
+    samples["t_us"], samples["position_mm"] = np.arange(position_mm.size) * 10_000, position_mm
+    faults = stage_faults(replace(recording, stage_samples=samples), (0, samples["t_us"][-1]))
+    assert not [line for line in faults if "jumps" in line]
 
 
 def test_words_that_are_none_have_one_reason(recording):
