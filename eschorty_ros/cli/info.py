@@ -129,8 +129,12 @@ def _stage(samples: NDArray[np.void]) -> dict[str, str]:
 
 
 def _scan(scan: ScanLog) -> dict[str, str]:
+    from eschorty_ros.core.clocks import POSITION_LIMIT_MM
+
+    limited = scan.stop_mm - scan.start_mm < 2.0 * POSITION_LIMIT_MM
+    limits = f", {scan.start_mm:g} to {scan.stop_mm:g} mm" if limited else ""
     return {
-        "scan": f"{scan.scan_id}, {scan.start_mm:g} to {scan.stop_mm:g} mm",
+        "scan": f"{scan.scan_id}{limits}",
         "recording": "; ".join(scan.faults) or "complete",
     }
 
