@@ -52,7 +52,8 @@ def command(
 
     if is_bag(source):
         refuse_given(["storage"], "is for a bag that is written; TARGET is a recording")
-        recording_of(source, target, frequency, calibration, packet_period)
+        if lacking := recording_of(source, target, frequency, calibration, packet_period):
+            warn(lacking)
         click.echo(str(target))
         return
     refuse_given(("frequency", "calibration", "packet_period"), "is for a bag; SOURCE is none")
@@ -69,12 +70,10 @@ def recording_of(
     calibration: str | None,
     packet_period_ms: float,
     settings: dict[str, Any] | None = None,
-) -> None:
-    """Write the recording of a bag, with these settings; what it lacks is a warning."""
+) -> str:
+    """Write the recording of a bag, with these settings; return what it lacks."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.live.bag_conversion import bag_to_recording
 
     build = None if calibration is None else load_calibration(calibration)
-    lacking = bag_to_recording(bag, folder, build, frequency, settings, 1e-3 * packet_period_ms)
-    if lacking:
-        warn(lacking)
+    return bag_to_recording(bag, folder, build, frequency, settings, 1e-3 * packet_period_ms)

@@ -146,18 +146,25 @@ def _latched(source: BagReader, stream: PacketStream, kinds: tuple[str, ...]) ->
         if (message := next(iter(source.messages(kind)), None)) is None:
             continue
         if kind == LASER:
-            stream.set_laser(*laser_settings(message.fields)[:2])
+            stream.set_laser(*_laser(source, message.fields)[:2])
         else:
-            _set(stream, kind, message.fields)
+            _set(source, stream, kind, message.fields)
 
 
-def _set(stream: PacketStream, kind: str, fields: Any) -> None:
+def _laser(source: BagReader, fields: Any) -> tuple[Modulation, int | None, int | None]:
+    try:
+        return laser_settings(fields)
+    except ArgumentError as error:
+        raise FormatError(f"{source.path}: laser/state: {error}, or give --frequency") from error
+
+
+def _set(source: BagReader, stream: PacketStream, kind: str, fields: Any) -> None:
     if kind == CLOCK:
         stream.announce_zero(ns_from_stamp(fields.header.stamp) - ns_from_stamp(fields.time_ref))
     elif kind == TRIGGER:
         stream.set_pulses(pulse_train(fields))
     else:
-        stream.set_laser(*laser_settings(fields))
+        stream.set_laser(*_laser(source, fields))
 
 
 def _play(
@@ -172,7 +179,7 @@ def _play(
             track.append(t_ns // NS_PER_US, position_mm)
             recorder.stage(t_ns, position_mm)
         elif message.kind in kinds:
-            _set(stream, message.kind, fields)
+            _set(source, stream, message.kind, fields)
         else:
             if fields.encoding != "evt3":
                 raise FormatError(

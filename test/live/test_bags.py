@@ -146,6 +146,27 @@ def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source
     np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
 
 
+def test_a_laser_without_a_frequency_is_named(tmp_path, source):
+    messages = bag_messages(source, tmp_path / "bag")
+    for message in messages:
+        if message.kind == bag_files.LASER:
+            message.fields.frequency = 0.0
+    write_messages(tmp_path / "off", messages, {})
+    with pytest.raises(EschortyError, match=r"off: laser/state: .* 0\.0; .* give --freq"):
+        bag_to_recording(tmp_path / "off", tmp_path / "rec")
+    bag_to_recording(tmp_path / "off", tmp_path / "rec", frequency_hz=70.0)
+
+
+def test_losses_of_a_bag_are_one_warning_and_a_scan_without_limits_has_none(tmp_path, scanned):
+    messages = bag_messages(scanned, tmp_path / "bag")
+    write_messages(tmp_path / "lost", messages, {})
+    done = CliRunner().invoke(main, ["reconstruct", str(tmp_path / "lost")])
+    assert (done.exit_code, done.stderr.count("were lost on the way")) == (0, 1), done.output
+    assert CliRunner().invoke(main, ["convert", *map(str, (tmp_path / "lost", tmp_path / "rec"))])
+    shown = CliRunner().invoke(main, ["info", str(tmp_path / "rec" / "scan.yaml")]).stdout
+    assert ("lost" in shown, "mm" in shown) == (True, False)
+
+
 def test_packets_that_the_driver_does_not_number_are_refused(tmp_path, source):
     messages = bag_messages(source, tmp_path / "bag")
     for message in messages:
