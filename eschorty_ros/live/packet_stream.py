@@ -12,6 +12,7 @@ from eschorty_ros.core.evt3 import WRAP_US, first_time_high_us
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.live.light_warnings import LightWarnings
 from eschorty_ros.live.packet_times import (
     GAP_NS,
     Packet,
@@ -26,8 +27,6 @@ from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 _HELD_MAX = 1000
 # Packets without a TIME_HIGH, which a sensor repeats every 4 ms at least, that a decoder waits for.
 _TIMELESS_MAX = 64
-# Share by which a frequency differs from the same one read back.
-_OTHER_FREQUENCY = 1e-3
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -101,9 +100,7 @@ class PacketStream:
         self._source = b""
         self._last_stamp_ns = 0
         self._retired: Counter[str] = Counter()
-        self._counts_before: dict[str, int] = {}
-        self._last_warnings: list[str] | None = None
-        self._changed_while_on = False
+        self._warnings = LightWarnings()
         self._out: list[TimedProfiles] = []
 
     @property
@@ -174,28 +171,8 @@ class PacketStream:
                 f"camera/events began again {self.restarts:,} times in {self.packets:,} packets; "
                 "seq has to be one more with each packet: let the driver number them"
             ]
-        if self._last_warnings is not None:
-            return self._last_warnings
-        reconstructor, wanted = self._reconstructor, self._settings.periods_per_profile
-        if reconstructor is None:
-            return []
-        used = reconstructor.settings.periods_per_profile
-        limited = f"periods_per_profile is {wanted}; {self.frequency_hz:g} Hz allows {used}"
-        lines = [limited] if used < wanted else []
-        reported_hz = self._reported[0].frequency_hz if self._reported else self.frequency_hz
-        if abs(self.frequency_hz / reported_hz - 1.0) > _OTHER_FREQUENCY:
-            lines.append(
-                f"frequency is {self.frequency_hz:g} Hz and the laser reports {reported_hz:g} Hz; "
-                "correct it, or set it to 0"
-            )
-        if self._changed_while_on:
-            lines.append("the laser's modulation was changed while it was on")
-        return [*lines, *reconstructor.warnings_since(self._counts_before)]
-
-    def _restart_warnings(self) -> None:
-        self._last_warnings, reconstructor = None, self._reconstructor
-        self._changed_while_on = False
-        self._counts_before = {} if reconstructor is None else reconstructor.counters
+        laser_hz = 0.0 if self._reported is None else self._reported[0].frequency_hz
+        return self._warnings.lines(self._reconstructor, self._settings, laser_hz)
 
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
@@ -216,7 +193,7 @@ class PacketStream:
         self._recorder = recorder
         if recorder is not None:
             self._renew()
-        self._restart_warnings()
+        self._warnings.restart(self._reconstructor)
         if self._zero_ended and self._epoch is not None and self._epoch.clock.exact:
             self._retire()
             self._epoch = None
@@ -236,15 +213,14 @@ class PacketStream:
         """
         switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
         if on_since_ns is None and self._on_since_ns is not None:
-            # Periods without light have few events, and follow no laser.
-            self._last_warnings = self.warnings
+            self._warnings.end(self.warnings)
         self._on_since_ns = on_since_ns
         before, self._reported = self._laser, (modulation, epoch_ns)
         self._follow_laser(before)
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
         if switched_on:
-            self._restart_warnings()
+            self._warnings.restart(self._reconstructor)
         if self._recorder is not None and switched_on:
             self._recorder.laser_on()
 
@@ -258,7 +234,8 @@ class PacketStream:
         if before is None or before == self._laser:
             return
         modulation = self._laser[0] if self._laser is not None else None
-        self._changed_while_on |= modulation != before[0] and self._on_since_ns is not None
+        if modulation != before[0] and self._on_since_ns is not None:
+            self._warnings.note_change()
         if self._reconstructor is None:
             return
         if modulation and self._reconstructor.settings == self._settings.allowed(modulation):
@@ -466,7 +443,7 @@ class PacketStream:
         self._collect(reconstructor.flush())
         # In this order, as other threads read the counters.
         self._reconstructor = None
-        self._counts_before = {}
+        self._warnings.count_from(None)
         self._retired.update(reconstructor.counters)
 
     def _collect(self, profiles: Profiles) -> None:
