@@ -186,7 +186,8 @@ def _play(
                     f"{source.path}: encoding is {short(fields.encoding)}; record evt3"
                 )
             name = f"a packet of {source.path}"
-            refuse_other_sensor(name, fields.width, fields.height, stream.calibration)
+            size = fields.width, fields.height
+            refuse_other_sensor(name, *size, stream.calibration, larger=True)
             check_span(fields.events)
             t_ns = ns_from_stamp(fields.header.stamp)
             packet = Packet(int(fields.seq), t_ns, memoryview(fields.events))

@@ -187,7 +187,7 @@ def test_a_conversion_that_fails_leaves_no_recording(tmp_path, source):
     assert not (tmp_path / "rec").exists()
 
 
-def test_a_bag_of_a_camera_of_another_size_is_refused(tmp_path, source):
+def test_a_bag_of_a_smaller_camera_is_refused(tmp_path, source):
     recording_to_bag(source, tmp_path / "bag")
     with pytest.raises(EschortyError, match="of a sensor of 64 x 720 and nominal of one of 1280"):
         bag_to_recording(tmp_path / "bag", tmp_path / "rec", load_calibration("nominal"))

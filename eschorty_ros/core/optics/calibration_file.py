@@ -295,16 +295,22 @@ def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None
             )
 
 
-def refuse_other_sensor(events: str, width: int, height: int, calibration: Calibration) -> None:
+def refuse_other_sensor(
+    events: str, width: int, height: int, calibration: Calibration, *, larger: bool = False
+) -> None:
     """Refuse events of a sensor of another size than the calibration's; 0 x 0 is unknown.
+
+    A ``larger`` one may be taken: its other events are counted as outside the sensor, and an
+    emulated EVK4 may serve a build of fewer pixels.
 
     Raises ``CalibrationError``, which names the ``events`` and both sizes.
     """
-    size = width, height
-    if size not in ((0, 0), (calibration.columns, calibration.rows)):
+    columns, rows = calibration.columns, calibration.rows
+    holds = larger and width >= columns and height >= rows
+    if not holds and (width, height) not in ((0, 0), (columns, rows)):
         raise CalibrationError(
             f"{events} is of a sensor of {width} x {height} and {calibration.name} of one of "
-            f"{calibration.columns} x {calibration.rows}; give the calibration of this camera"
+            f"{columns} x {rows}; give the calibration of this camera"
         )
 
 

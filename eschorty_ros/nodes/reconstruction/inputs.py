@@ -25,7 +25,7 @@ def packet_from_message(message: bytes, source: bytes, calibration: Calibration)
     To make an object of the message costs as much as some thousand events.
 
     Raises ``ArgumentError`` when it cannot be read, has another encoding or more bytes than a
-    packet may have, and ``CalibrationError`` when it is of a sensor of another size.
+    packet may have, and ``CalibrationError`` when it is of a smaller sensor.
     """
     if message[:2] != _LITTLE_ENDIAN:
         raise ArgumentError("a packet is not serialized in little-endian order; send it so")
@@ -44,7 +44,7 @@ def packet_from_message(message: bytes, source: bytes, calibration: Calibration)
         raise ArgumentError(f"a packet cannot be read: {error}") from error
     if encoding != "evt3":
         raise ArgumentError(f"encoding is {short(encoding)}; set the camera to evt3")
-    refuse_other_sensor("a packet", width, height, calibration)
+    refuse_other_sensor("a packet", width, height, calibration, larger=True)
     if size > _PACKET_MAX_BYTES:
         raise ArgumentError(
             f"a packet has {size} bytes; send {_PACKET_MAX_BYTES} at most, at a lower threshold"

@@ -52,7 +52,8 @@ def test_big_endian_is_refused():
         packet_from_message(b"\0\0" + event_packet()[2:], b"", BUILD)
 
 
-def test_a_sensor_of_another_size_is_refused_and_an_unknown_one_taken():
+def test_a_smaller_sensor_is_refused_and_a_larger_or_unknown_one_taken():
     with pytest.raises(CalibrationError, match="of a sensor of 640 x 480 and config_3 of one of"):
         packet_from_message(event_packet(width=640, height=480), b"", BUILD)
-    assert packet_from_message(event_packet(width=0, height=0), b"", BUILD).source == b""
+    for size in ({"width": 0, "height": 0}, {"width": 1920, "height": 1080}):
+        assert packet_from_message(event_packet(**size), b"", BUILD).source == b""
