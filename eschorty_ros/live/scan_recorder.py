@@ -190,7 +190,7 @@ class ScanRecorder:
         except EschortyError as error:
             self._failure = self._failure or str(error)
         except Exception as error:
-            # Whoever waits for the disk would wait for ever.
+            # A caller that waits for the disk would never return.
             self._failure = self._failure or repr(error)
 
     def _begin(self) -> None:

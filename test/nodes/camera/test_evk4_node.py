@@ -38,7 +38,7 @@ class Run:
         self.observer, self.source, self.model = observer, source, model
         self.packets = observer.collect(EventPacket, "camera/events", qos.events())
         self.reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
-        self.beats = observer.collect(Header, "camera/heartbeat", qos.heartbeat())
+        self.heartbeats = observer.collect(Header, "camera/heartbeat", qos.heartbeat())
 
     def status(self, condition: Callable[[DiagnosticStatus], bool], what: str) -> DiagnosticStatus:
         def found() -> DiagnosticStatus | None:
@@ -98,7 +98,7 @@ def test_events_stream_with_arrival_stamps(start: Start) -> None:
     values = {value.key: value.value for value in status.values}
     assert (values["serial"], values["firmware"]) == ("00051234", "3.9.0")
     assert {"temperature_c", "drops", "reconnects", "on_events_per_s"} <= set(values)
-    wait_until(lambda: run.beats, "a beat")
+    wait_until(lambda: run.heartbeats, "a heartbeat")
 
 
 def test_packets_collect_events_for_longer_while_the_laser_is_off_and_not_armed(
@@ -130,10 +130,10 @@ def test_an_unplugged_camera_is_reported_at_once_and_the_stream_restarts_at_zero
     )
     assert run.node.active
     assert not run.node.healthy
-    wait_until(lambda: run.beats[-1].frame_id.endswith(" stopped"), "a last beat")
-    beats = len(run.beats)
+    wait_until(lambda: run.heartbeats[-1].frame_id.endswith(" stopped"), "a last heartbeat")
+    count = len(run.heartbeats)
     time.sleep(0.2)
-    assert all(beat.frame_id.endswith(" stopped") for beat in run.beats[beats:])
+    assert all(one.frame_id.endswith(" stopped") for one in run.heartbeats[count:])
     run.model.replug()
     wait_until(lambda: run.node.healthy, "the camera back")
 

@@ -34,7 +34,15 @@ with contextlib.suppress(SystemExit):
 names = [path.read_text().strip() for path in pathlib.Path("/proc/self/task").glob("*/comm")]
 print("left:", *(name for name in names if name.startswith("dds.udp")))
 """
-STRAY = ("Traceback", "context is", "Destroyable", "RCLError", "Exception", "not safe", "Invalid")
+UNWANTED = (
+    "Traceback",
+    "context is",
+    "Destroyable",
+    "RCLError",
+    "Exception",
+    "not safe",
+    "Invalid",
+)
 
 
 @contextlib.contextmanager
@@ -65,7 +73,7 @@ def assert_ctrl_c_ends(running: Mapping[str, NodeProcess]) -> None:
         printed = process.output[before[name] :]
         print(f"--- {name}\n{printed}")
         assert process.wait() == 0
-        assert not [word for word in STRAY if word in printed]
+        assert not [word for word in UNWANTED if word in printed]
 
 
 def test_in_the_middle_of_a_sweep(tmp_path: Path) -> None:
