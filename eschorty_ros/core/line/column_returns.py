@@ -126,7 +126,7 @@ def _vote(columns, c, a, b, half):
 def _stronger(column, c, half, columns, estimator, blink, found):
     """Return the stronger one of a column's two returns; in a stream its neighbours vote.
 
-    Boxes of dense events are full in the middle of every line; complete windows tell them apart.
+    Boxes of dense events are full in the middle of every line; complete windows separate them.
     """
     both = _all_returns(column, half, estimator, found)
     a, b = both.window, both.other
