@@ -30,6 +30,8 @@ TICKS_IN_3D = 5
 LABEL_PAD = 6.0
 SHORT_SIDE = 0.4
 LONG_MAP = 8.0
+# Width of a map, height of what is above and below it, and of a row at least and at most; inches.
+MAP_IN, BAR_IN, ROWS_IN = 5.4, 1.9, (3.8, 4.9)
 SIGMAS_SHOWN = 5.0
 DPI = 110
 PIXELS_MAX = 200_000_000
@@ -51,17 +53,22 @@ def scan_figure(
     stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
     grid = grid_of(points, stage_mm)
     rows = 1 if error_mm is None else 2
-    figure = new_figure(12.0, 4.9 * rows)
+    # A view alone needs all the height.
+    figure = new_figure(12.0, ROWS_IN[1] if rows == 1 else 2.0 * _row_in(grid))
     if title:
         figure.suptitle(title, parse_math=False)
     limits = central(range_mm)
-    axes = figure.add_subplot(rows, 2, 1)
+    halves: Any = figure.subfigures(1, 2)
+    left, right = halves
+    # The view needs more room than the histogram below it, and some for its labels.
+    beside = right.add_gridspec(2, 1, height_ratios=(9, 6 if rows == 2 else 1), hspace=0.2)
+    axes = left.add_subplot(rows, 1, 1)
     draw_map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
     axes.set_title("Depth map")
-    _view_3d(figure.add_subplot(rows, 2, 2, projection="3d"), points, range_mm, limits)
+    _view_3d(right.add_subplot(beside[0], projection="3d"), points, range_mm, limits)
     if error_mm is not None:
         bound = _error_bound(error_mm)
-        axes = figure.add_subplot(rows, 2, 3)
+        axes = left.add_subplot(rows, 1, 2)
         draw_map(
             axes,
             grid,
@@ -71,8 +78,14 @@ def scan_figure(
             (-bound, bound),
         )
         axes.set_title("Measured minus true range")
-        _histogram(figure.add_subplot(rows, 2, 4), error_mm, points["sigma"] * 1e3)
+        _histogram(right.add_subplot(beside[1]), error_mm, points["sigma"] * 1e3)
     return figure
+
+
+def _row_in(grid: Grid) -> float:
+    """Return the height of a map with its colour bar, in inches: less where it is wide."""
+    across = float(np.ptp(_line_edges(grid.stage_mm)) / np.ptp(grid.along_mm))
+    return float(np.clip(MAP_IN * across + BAR_IN, *ROWS_IN))
 
 
 def cloud_figure(points: NDArray[np.void], title: str) -> Figure:
