@@ -96,7 +96,7 @@ _OF_SOURCES = ("moving", "range_per_stage", "free", "prior", "robust", "row_sigm
 )  # fmt: skip
 @click.option(
     "--range-sigma", type=Number(0), default=1.0, show_default=True,
-    help="Error of a known range, mm, where the file gives none.",
+    help="Error of a known range, mm, where the file gives none; of --moving it shifts all ranges.",
 )  # fmt: skip
 @click.option(
     "--fake",
@@ -134,7 +134,7 @@ def command(
 
     \b
     targets.csv   row,range_mm[,row_sigma][,range_sigma_mm][,column]
-                  [,width_px,size_mm][,spacing_px,spacing_mm][,label]
+                  [,width_px,size_mm][,spacing_px,spacing_mm][,shared_sigma_mm][,label]
       row         row of the target, px; row_sigma its error
       range_mm    range along the laser sheet from the mechanical datum
       width_px    columns a target of size_mm covers; two sizes or more, because light blooms
@@ -268,8 +268,8 @@ def _recorded(
 
         if moving is not None:
             return recorded_moving_target(
-                recording, design, moving, range_per_stage=range_per_stage, blocks=blocks,
-                progress=progress,
+                recording, design, moving, range_per_stage=range_per_stage,
+                sigma_at_zero_mm=range_sigma, blocks=blocks, progress=progress,
             )  # fmt: skip
         match = recorded_posts(recording, _known(distances, range_sigma), design, progress)
     for line in match.rejected:

@@ -154,6 +154,7 @@ class SweepCapture(_Frame):
             np.concatenate([stage_mm for _, stage_mm in parts]),
             self._target.range_mm,
             range_per_stage=self._sweep.range_per_stage,
+            sigma_at_zero_mm=self._target.sigma_range_mm,
         )
         lost = profiles.profile_count - len(targets)
         rejected = (f"{lost} profiles show no whole target, or one off the others",) * (lost > 0)

@@ -126,6 +126,14 @@ def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
     print(f"seed {SEED}: range error {error} mm at 1520 and 1800 mm")
     assert np.abs(error).max() < 1.0
     assert made.columns == 48
+    # The error of the target's range, 1 mm by default, is that of all ranges.
+    exact, far = (
+        made_by(tmp_path / "made.yaml", *folders, *options, "--range-sigma", sigma_mm)
+        for sigma_mm in (0.0, 5.0)
+    )
+    shared = np.subtract(made.covariance, exact.covariance)
+    assert shared[1][1] > 0.0
+    np.testing.assert_allclose(np.subtract(far.covariance, exact.covariance), 25 * shared, 1e-6)
 
 
 def test_roll_and_smile_show_in_a_target_moved_by_the_stage(tmp_path):

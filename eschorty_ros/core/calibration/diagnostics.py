@@ -16,7 +16,13 @@ from eschorty_ros.core.calibration.fit import (
     fit,
     solve,
 )
-from eschorty_ros.core.calibration.residuals import COLUMN_TERMS, WIDTH_BIAS, Observed, Problem
+from eschorty_ros.core.calibration.residuals import (
+    COLUMN_TERMS,
+    WIDTH_BIAS,
+    Observed,
+    Problem,
+    covariance,
+)
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
@@ -104,7 +110,9 @@ def leave_one_out_px(targets: Targets, design: RangeModel, found: CalibrationFit
     observed = Observed.of(targets, design, found.free)
     problem = Problem(observed, design, found.free, found.prior_sigma, found.values)
     white = problem.whitened(found.values)
-    left = np.eye(white.shape[1]) - problem.leverage(found.values, found.covariance)
+    # Without the error that all ranges share: it moves the others as much.
+    own = covariance(problem.jacobian(problem.free(found.values)))
+    left = np.eye(white.shape[1]) - problem.leverage(found.values, own)
     alone = np.linalg.eigvalsh(left)[:, 0] < 1e-9
     left[alone] = np.eye(white.shape[1])
     without = np.linalg.solve(left, white[:, :, None])

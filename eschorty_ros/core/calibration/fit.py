@@ -172,13 +172,16 @@ def fit(
         )
     if dof == 0:
         verdicts.append("no degrees of freedom: the residuals carry no information; add targets")
+    spread = covariance(jacobian)
+    # The fitted parameters move with an error that all ranges share.
+    moved = spread @ (jacobian.T @ problem.shared(values))
     residual, white = problem.observed.residual(values), problem.residual(at)
     if residual is None or white is None:
         raise FitError("the targets lead to no possible build; check them")
     return CalibrationFit(
         model,
         names,
-        covariance(jacobian),
+        spread + np.outer(moved, moved),
         residual[:, 0],
         problem.sigma_px[:, 0],
         values[WIDTH_BIAS],

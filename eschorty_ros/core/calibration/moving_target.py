@@ -30,6 +30,7 @@ def moving_target(
     range_at_zero_mm: float,
     *,
     range_per_stage: float = 1.0,
+    sigma_at_zero_mm: float = 0.0,
     blocks: int = 1,
 ) -> Targets:
     """Turn every profile of a moving flat target into a target of known range.
@@ -45,7 +46,8 @@ def moving_target(
     - ``stage_mm``: Shape (len(profiles),). Stage position at each point's time, as
       ``StageTrack.position_mm`` gives it; points with NaN are left out.
     - ``range_at_zero_mm``: Range of the target with the stage at 0. Its error shifts all targets
-      alike and becomes an error of ``b``, which no number of profiles reveals.
+      alike, which no number of profiles reveals: ``sigma_at_zero_mm``, its standard deviation,
+      becomes the targets' ``sigma_shared_mm``.
     - ``range_per_stage``: Range gained per stage travel: 1 when the stage moves the target away
       along the sheet, -1 towards the sensor, the cosine of the angle in between.
     - ``blocks``: Targets per profile, side by side: several determine how ``b'`` varies along the
@@ -63,6 +65,7 @@ def moving_target(
     number("range_at_zero_mm", range_at_zero_mm)
     if number("range_per_stage", range_per_stage, -1.0, 1.0) == 0.0:
         raise ArgumentError("range_per_stage is 0; the stage must change the target's range")
+    number("sigma_at_zero_mm", sigma_at_zero_mm, 0.0)
     integer("blocks", blocks, 1, 64)
     used = np.isfinite(position) & np.isfinite(profiles.row) & (profiles.return_index == 0)
     profiles, position = profiles.select(used), position[used]
@@ -77,7 +80,8 @@ def moving_target(
     block = (profiles.column.astype(np.int64) - low) * blocks // (high - low + 1)
     _, period = np.unique(profiles.edge_us, return_inverse=True)
     group = period * blocks + block
-    return _measured(profiles, position, group, range_at_zero_mm, range_per_stage)
+    at_zero_mm = range_at_zero_mm, sigma_at_zero_mm
+    return _measured(profiles, position, group, at_zero_mm, range_per_stage)
 
 
 def _lit_columns(profiles: Profiles) -> tuple[int, int]:
@@ -93,7 +97,7 @@ def _measured(
     profiles: Profiles,
     position: NDArray[np.float64],
     group: NDArray[np.int64],
-    range_at_zero_mm: float,
+    at_zero_mm: tuple[float, float],
     range_per_stage: float,
 ) -> Targets:
     """Return a target for each group of points with enough columns that agree."""
@@ -116,6 +120,7 @@ def _measured(
     variance = mean((row - np.repeat(centre, sizes)) ** 2)
     scatter = np.sqrt(np.maximum(variance, SIGMA_FLOOR_PX**2) / np.maximum(count, 1))
     at_mm = mean(position)[enough]
+    range_at_zero_mm, sigma_at_zero_mm = at_zero_mm
     range_mm = range_at_zero_mm + range_per_stage * at_mm
     if not (range_mm >= _NEAREST_MM).all():
         raise ArgumentError(
@@ -128,6 +133,7 @@ def _measured(
         sigma_row_px=np.hypot(scatter, math.hypot(GRID_SIGMA_PX, _LATE_PX))[enough],
         sigma_range_mm=_SIGMA_STAGE_MM * math.fabs(range_per_stage),
         column=mean(column)[enough],
+        sigma_shared_mm=sigma_at_zero_mm,
         labels=[f"stage {mm:.3f} mm" for mm in at_mm.tolist()],
     )
     return targets.select(_following(targets.row, 1.0 / targets.range_mm))

@@ -60,14 +60,15 @@ def recorded_moving_target(
     range_at_zero_mm: float,
     *,
     range_per_stage: float = 1.0,
+    sigma_at_zero_mm: float = 0.0,
     blocks: int = 1,
     progress: Callable[[int, int], Any] | None = None,
 ) -> Targets:
     """Return a target for every profile of a flat target that the stage moves along the range.
 
     - ``recording``, ``nominal``, ``progress``: As in `recorded_posts`.
-    - ``range_at_zero_mm``, ``range_per_stage``, ``blocks``: As in `moving_target`, which also lists
-      the errors.
+    - ``range_at_zero_mm``, ``range_per_stage``, ``sigma_at_zero_mm``, ``blocks``: As in
+      `moving_target`, which also lists the errors.
     """
     _check_sensor(recording, nominal)
     profiles = reconstruct_recording(recording, progress=progress).profiles
@@ -76,6 +77,7 @@ def recorded_moving_target(
         recording.stage.position_mm(profiles.t_us),
         range_at_zero_mm,
         range_per_stage=range_per_stage,
+        sigma_at_zero_mm=sigma_at_zero_mm,
         blocks=blocks,
     )
 

@@ -64,7 +64,8 @@ class Observed:
     per_pixel: Array
     """Shape (n, 3). Size and spacing over the pixel pitch; 0 for rows and where unknown."""
     sigma_range_mm: Array
-    """Shape (n,)."""
+    sigma_shared_mm: Array
+    """Shape (n,). Of each range alone, and of the error that all ranges share."""
 
     @classmethod
     def of(cls, targets: Targets, design: RangeModel, names: Sequence[str]) -> Observed:
@@ -87,6 +88,7 @@ class Observed:
             known,
             np.where(known, size_mm, 0.0) / (design.pixel_um * 1e-3),
             targets.sigma_range_mm,
+            targets.sigma_shared_mm,
         )
 
     def __len__(self) -> int:
@@ -184,6 +186,13 @@ class Problem:
         prior = np.zeros((len(self.priors), len(self.names)))
         prior[np.arange(len(self.priors)), self._which] = 1.0 / self._spread
         return np.concatenate([white.reshape(-1, len(self.names))[self._rows], prior])
+
+    def shared(self, values: Values) -> Array:
+        """Return the derivatives of `residual` by the shared error in standard deviations."""
+        direct = self.observed.derivative(values, ["b_mm"])[:, :, 0]
+        direct = direct * self.observed.sigma_shared_mm[:, None]
+        white = np.einsum("nij,nj->ni", self._whitener, direct)
+        return np.concatenate([white.ravel()[self._rows], np.zeros(len(self.priors))])
 
     def whitened(self, values: Values) -> Array:
         """Return (measured - expected) / sigma, shape (n, 3); infinite for an impossible build."""

@@ -17,7 +17,7 @@ SIGMA_ROW_PX = 0.3
 SIGMA_WIDTH_PX = 0.4
 """Standard deviation of a width or a spacing, the difference of two edges or centres."""
 
-_ALWAYS = ("row", "range_mm", "sigma_row_px", "sigma_range_mm")
+_ALWAYS = ("row", "range_mm", "sigma_row_px", "sigma_range_mm", "sigma_shared_mm")
 _SIZES = (
     ("width_px", "sigma_width_px", "size_mm"),
     ("spacing_px", "sigma_spacing_px", "spacing_mm"),
@@ -55,6 +55,9 @@ class Targets:
     spacing_mm: Array
     """Columns between the centres of two marks at this range, its standard deviation, and the true
     distance; NaN where unknown. Blooming does not move centres."""
+    sigma_shared_mm: Array
+    """Standard deviation of an error that is the same for the ranges of all these targets, such as
+    that of one moved target; 0 or more. It adds to the covariance and to no residual."""
     labels: tuple[str, ...]
     """Names of the targets in messages and reports; ``1``, ``2``, ... by default."""
 
@@ -71,10 +74,11 @@ class Targets:
         spacing_px: ArrayLike = math.nan,
         sigma_spacing_px: ArrayLike = SIGMA_WIDTH_PX,
         spacing_mm: ArrayLike = math.nan,
+        sigma_shared_mm: ArrayLike = 0.0,
         labels: Sequence[str] = (),
     ) -> None:
         given = (row, range_mm, sigma_row_px, sigma_range_mm, column, width_px, sigma_width_px,
-                 size_mm, spacing_px, sigma_spacing_px, spacing_mm)  # fmt: skip
+                 size_mm, spacing_px, sigma_spacing_px, spacing_mm, sigma_shared_mm)  # fmt: skip
         size = np.atleast_1d(reals("row", row)).size
         for name, value in zip(_NUMBERS, given, strict=True):
             entries = reals(name, value)
@@ -96,7 +100,8 @@ class Targets:
             self._refuse(name, ~np.isfinite(getattr(self, name)), "give a finite number")
         self._refuse("range_mm", self.range_mm <= 0.0, "choose a positive range")
         self._refuse("sigma_row_px", self.sigma_row_px <= 0.0, "choose a positive number")
-        self._refuse("sigma_range_mm", self.sigma_range_mm < 0.0, "choose 0 or more")
+        for name in ("sigma_range_mm", "sigma_shared_mm"):
+            self._refuse(name, getattr(self, name) < 0.0, "choose 0 or more")
         self._refuse("column", np.isinf(self.column), "give a finite number")
         for name in _POSITIVE_OR_UNKNOWN:
             value = getattr(self, name)

@@ -33,6 +33,7 @@ _COLUMNS = {
     "spacing_px": "spacing_px",
     "spacing_sigma_px": "sigma_spacing_px",
     "spacing_mm": "spacing_mm",
+    "shared_sigma_mm": "sigma_shared_mm",
 }
 TARGET_COLUMNS = (*_COLUMNS, "label")
 _BYTES_MAX = 16 << 20
@@ -49,8 +50,8 @@ def read_targets(
 
     - ``path``: CSV with a header line: ``row`` and ``range_mm``, and any of ``row_sigma``,
       ``range_sigma_mm``, ``column``, ``width_px``, ``width_sigma_px``, ``size_mm``, ``spacing_px``,
-      ``spacing_sigma_px``, ``spacing_mm``, ``label``, in any order. An empty cell means unknown;
-      lines that begin with ``#`` are comments.
+      ``spacing_sigma_px``, ``spacing_mm``, ``shared_sigma_mm``, ``label``, in any order. An empty
+      cell means unknown; lines that begin with ``#`` are comments.
     - ``sigma_row_px``, ``sigma_range_mm``: Standard deviations where the file gives none.
 
     Raises ``FormatError``, which names file, line or label, column and value.
@@ -62,6 +63,7 @@ def read_targets(
         "range_sigma_mm": sigma_range_mm,
         "width_sigma_px": SIGMA_WIDTH_PX,
         "spacing_sigma_px": SIGMA_WIDTH_PX,
+        "shared_sigma_mm": 0.0,
     }
     numbers = {
         _COLUMNS[name]: [line.number(name, default.get(name, math.nan)) for line in table]

@@ -129,6 +129,22 @@ def test_sigma_grows_with_range_and_includes_the_centroids():
     assert both[0] < both[1] < both[2]
 
 
+@pytest.mark.parametrize("free", [("k_prime_px", "b_prime_px"), None])
+def test_an_error_that_all_ranges_share_is_in_the_sigma(free):
+    """One target on a stage, measured 4 mm too far: 4 sigma of nothing else, 4 mm / 3 of this."""
+    ranges = np.linspace(850.0, 2000.0, 200)
+    row = TRUTH.row(ranges) + np.random.default_rng(SEED).normal(0.0, 0.1, 200)
+    targets = Targets(row, ranges + 4.0, 0.1, 0.01, sigma_shared_mm=3.0)
+    report = calibrate(targets, NOMINAL, free=free)
+    pulls = report.residual_mm / report.range_sigma_mm(row)
+    true_mm = np.array([900.0, 1320.0, 1900.0])
+    error = report.fit.model.range_mm(TRUTH.row(true_mm)) - true_mm
+    ratio = error / report.range_sigma_mm(TRUTH.row(true_mm))
+    print(f"seed {SEED}: errors {error} mm, {ratio} sigma; residuals {np.abs(pulls).max():.2f}")
+    assert ratio == pytest.approx(4.0 / 3.0, abs=0.25)
+    assert np.nanmax(np.abs(report.leave_one_out_px - report.residual_px)) < 0.02
+
+
 def test_roll_and_smile_come_back_from_a_target_at_many_columns():
     truth = replace(TRUTH, b_prime_1_px=-6.0, b_prime_2_px=2.5)
     rng = np.random.default_rng(SEED)

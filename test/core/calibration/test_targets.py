@@ -42,6 +42,7 @@ def test_parts_are_joined_and_selected_with_their_labels():
         ({"range_mm": [800.0, np.inf]}, "range_mm of target far is inf"),
         ({"sigma_row_px": 0.0}, "sigma_row_px of target near is 0"),
         ({"sigma_range_mm": -1.0}, "sigma_range_mm of target near is -1; choose 0 or more"),
+        ({"sigma_shared_mm": -1.0}, "sigma_shared_mm of target near is -1; choose 0 or more"),
         ({"column": np.inf}, "column of target near is inf"),
         ({"size_mm": -1.0}, "size_mm of target near is -1; choose a positive number or NaN"),
         ({"width_px": [9.0, np.inf]}, "width_px of target far is inf"),

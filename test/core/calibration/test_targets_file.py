@@ -43,13 +43,14 @@ def test_written_targets_come_back_to_the_last_bit(tmp_path):
     targets = Targets(
         [53.1, 1.0 / 3.0], [820.0, 2050.0000000000002], [0.1, 0.3], [0.0, 1e-9],
         column=[nan, 639.5], width_px=[nan, 154.2], sigma_width_px=[nan, 0.4],
-        size_mm=[nan, 25.4], labels=["near, left", "posts \u201cA\u201d"],
+        size_mm=[nan, 25.4], sigma_shared_mm=[0.0, 1.0 / 7.0],
+        labels=["near, left", "posts \u201cA\u201d"],
     )  # fmt: skip
     write_targets(tmp_path / "targets.csv", targets)
     back = read_targets(tmp_path / "targets.csv")
     assert back.labels == targets.labels
     for name in ("row", "range_mm", "sigma_row_px", "sigma_range_mm", "column", "width_px",
-                 "size_mm", "spacing_px"):  # fmt: skip
+                 "size_mm", "spacing_px", "sigma_shared_mm"):  # fmt: skip
         np.testing.assert_array_equal(getattr(back, name), getattr(targets, name), err_msg=name)
     assert back.has_width.tolist() == [False, True]
 
