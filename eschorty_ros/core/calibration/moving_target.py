@@ -81,7 +81,7 @@ def moving_target(
     _, period = np.unique(profiles.edge_us, return_inverse=True)
     group = period * blocks + block
     at_zero_mm = range_at_zero_mm, sigma_at_zero_mm
-    return _measured(profiles, position, group, at_zero_mm, range_per_stage)
+    return _measured(profiles, position, group, blocks, at_zero_mm, range_per_stage)
 
 
 def _lit_columns(profiles: Profiles) -> tuple[int, int]:
@@ -97,6 +97,7 @@ def _measured(
     profiles: Profiles,
     position: NDArray[np.float64],
     group: NDArray[np.int64],
+    blocks: int,
     at_zero_mm: tuple[float, float],
     range_per_stage: float,
 ) -> Targets:
@@ -127,10 +128,12 @@ def _measured(
             f"range_at_zero_mm is {range_at_zero_mm!r}: at a stage position of "
             f"{at_mm[np.argmin(range_mm)]:g} mm the target would be at or behind the datum"
         )
+    # The blocks of a profile have this part of their errors in common.
+    common_px = math.sqrt(blocks) * math.hypot(GRID_SIGMA_PX, _LATE_PX)
     targets = Targets(
         row=centre[enough],
         range_mm=range_mm,
-        sigma_row_px=np.hypot(scatter, math.hypot(GRID_SIGMA_PX, _LATE_PX))[enough],
+        sigma_row_px=np.hypot(scatter, common_px)[enough],
         sigma_range_mm=_SIGMA_STAGE_MM * math.fabs(range_per_stage),
         column=mean(column)[enough],
         sigma_shared_mm=sigma_at_zero_mm,
