@@ -341,12 +341,19 @@ def check_targets(targets: Targets, design: RangeModel, names: tuple[str, ...]) 
             f"range_mm is {targets.range_mm[behind][0]:g}; choose ranges beyond -b_mm = "
             f"{-design.b_mm:g} mm"
         )
-    if set(COLUMN_TERMS) & set(names) and np.isnan(targets.column).any():
+    if np.isnan(targets.column).any():
         at = int(np.flatnonzero(np.isnan(targets.column))[0])
-        raise ArgumentError(
-            f"column of target {targets.labels[at]} is unknown; give the column of every target "
-            f"or fix {' and '.join(COLUMN_TERMS)}"
-        )
+        unknown = f"column of target {targets.labels[at]} is unknown"
+        if set(COLUMN_TERMS) & set(names):
+            raise ArgumentError(
+                f"{unknown}; give the column of every target or fix {' and '.join(COLUMN_TERMS)}"
+            )
+        for name in COLUMN_TERMS:
+            if getattr(design, name) != 0.0:
+                raise ArgumentError(
+                    f"{unknown} and {name} of the nominal build is {getattr(design, name):g}; give "
+                    "the column of every target"
+                )
 
 
 def checked_free(free: Sequence[str]) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ class Post:
 
     column: float
     row: float
-    """Its middle between the two edges, and the line's row there, px."""
+    """The middle between its two edges on the sensor, and the line's row there, px."""
     sigma_row: float
     """Standard deviation of ``row``, px: the scatter of its columns and `GRID_SIGMA_PX`."""
     width_px: float

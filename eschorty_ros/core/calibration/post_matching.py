@@ -283,7 +283,8 @@ def _targets(
         range_mm=[target.range_mm for target in true],
         sigma_row_px=[post.sigma_row for post in measured],
         sigma_range_mm=[target.sigma_range_mm for target in true],
-        column=[math.nan if post.column_cut else post.column for post in measured],
+        # That of the row, also of a post whose middle the sensor's edge cuts off.
+        column=[post.column for post in measured],
         width_px=[math.nan if post.column_cut else post.width_px for post in measured],
         sigma_width_px=[post.sigma_width_px for post in measured],
         size_mm=[target.size_mm for target in true],

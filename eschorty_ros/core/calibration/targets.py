@@ -44,7 +44,7 @@ class Targets:
     sigma_range_mm: Array
     """Standard deviations; of a range 0 or more."""
     column: Array
-    """Column of the target's centre, px; NaN where unknown."""
+    """Column in which the target has this row, px; NaN where unknown."""
     width_px: Array
     sigma_width_px: Array
     size_mm: Array

@@ -159,6 +159,10 @@ def test_roll_and_smile_come_back_from_a_target_at_many_columns():
     assert np.abs(report.residual_mm).max() < 7.0
     assert np.sqrt(np.mean(report.residual_px**2)) == pytest.approx(0.3, rel=0.25)
     refused(ArgumentError, Targets(row, ranges), free=free, match="column of target 1 is unknown")
+    bent = replace(NOMINAL, b_prime_1_px=-6.0, b_prime_2_px=2.5)
+    with pytest.raises(ArgumentError, match="unknown and b_prime_1_px of the nominal build is -6;"):
+        calibrate(Targets(row, ranges), bent)
+    assert np.abs(calibrate(targets, bent).residual_mm).max() < 7.0
 
 
 def refused(error, targets, *args, match, **options):

@@ -189,6 +189,14 @@ def test_cut_lines_are_rejected_with_the_reason():
     assert "edge cuts its line" in result.rejected[0]
 
 
+def test_a_post_that_the_edge_of_the_columns_cuts_keeps_its_row_and_column_alone():
+    known = (900.0, 1200.0, 1400.0)
+    posts = [replace(post(100.0 * i, r), column_cut=i == 0) for i, r in enumerate(known)]
+    targets = match_posts(posts, ranges(*known), NOMINAL).targets
+    assert targets.column.tolist() == [0.0, 100.0, 200.0]
+    assert np.isnan(targets.width_px).tolist() == [True, False, False]
+
+
 def test_no_post_at_all_is_no_error_here():
     result = match_posts([], ranges(1000.0, 1500.0), NOMINAL)
     assert result.targets is None
