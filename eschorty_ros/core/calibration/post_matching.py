@@ -143,7 +143,9 @@ class _LineSearch:
         self, posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
     ) -> None:
         self._nominal = nominal
-        self._row = np.array([post.row for post in posts])
+        # Rows as in the principal column: roll and smile move the others.
+        aside = nominal.row_offset_px([post.column for post in posts]) - nominal.b_prime_px
+        self._row = np.array([post.row for post in posts]) + aside
         self._inverse = 1.0 / (np.array([t.range_mm for t in known]) + nominal.b_mm)
         sigma_row = np.array([post.sigma_row for post in posts])
         slope = -nominal.product_mm_px * self._inverse**2
@@ -179,7 +181,7 @@ class _LineSearch:
         return list(best)
 
     def row_of(self, target: KnownTarget) -> float:
-        """Return the row of ``target`` by the line found, NaN without one."""
+        """Return the row of ``target`` in the principal column, NaN without a line."""
         if self._line is None:
             return math.nan
         return self._line[0] / (target.range_mm + self._nominal.b_mm) + self._line[1]

@@ -145,6 +145,18 @@ def test_order_does_not_matter_and_what_is_missing_is_named():
     assert result.rejected == (f"target 1700 mm: no fitting post near row {row:.1f}",)
 
 
+def test_posts_of_a_line_with_roll_and_smile_are_matched():
+    bend = {"b_prime_1_px": 15.0, "b_prime_2_px": 5.0}
+    bent, known = replace(AS_BUILT, **bend), (850.0, 1000.0, 1200.0, 1500.0, 1900.0)
+    columns = (1200.0, 60.0, 900.0, 350.0, 640.0)
+    posts = [
+        replace(post(column, r), row=float(bent.row(r, column)))
+        for column, r in zip(columns, known, strict=True)
+    ]
+    assert len(match_posts(posts, ranges(*known), replace(NOMINAL, **bend)).pairs) == 5
+    assert len(match_posts(posts, ranges(*known), NOMINAL).pairs) < 5
+
+
 def test_a_displaced_post_is_rejected_by_name():
     known = (850.0, 1000.0, 1200.0, 1500.0, 1900.0)
     posts = [post(100.0 * i, r, shift_px=12.0 * (r == 1200.0)) for i, r in enumerate(known)]
