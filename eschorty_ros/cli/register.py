@@ -54,9 +54,9 @@ def command(
 ) -> None:
     """Bring CLOUDS (.pcd or .ply of this package) into the frame of the first; needs open3d.
 
-    Each is registered against those before it by generalised ICP with the points' own sigmas as
-    weights. Printed are its rotation, its shift at the middle of the overlap, both with sigma, and
-    with --json the transform in m and the covariance.
+    Each is registered against those before it by ICP with the points' own sigmas as weights.
+    Printed are its rotation, its shift at the middle of the overlap, both with sigma, and with
+    --json the transform in m and the covariance.
 
     \b
     Examples:

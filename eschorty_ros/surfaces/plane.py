@@ -23,7 +23,7 @@ COMMON_SHARE = 0.16
 """Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
 MAD = 1.4826
 """Standard deviation of Gaussian errors over their median absolute deviation."""
-_CUT_SIGMA = 4.0
+CUT_SIGMA = 4.0
 _SURE_SIGMAS = 3.0
 _ITERATIONS = 20
 # Errors of columns closer than 17, which smoothing averages at most, and of lines closer than 4 are
@@ -134,7 +134,7 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
         residual = part.xyz[:, 0] - design @ values
         ratio = residual / part.sigma
         scale = max(MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
-        before, kept = kept, np.abs(ratio) <= _CUT_SIGMA * scale
+        before, kept = kept, np.abs(ratio) <= CUT_SIGMA * scale
         if np.array_equal(kept, before):
             break
     covariance = clustered_covariance(design[kept], residual[kept], part.select(kept))

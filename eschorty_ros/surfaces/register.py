@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,17 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import organise
-from eschorty_ros.surfaces.plane import COMMON_SHARE, MAD, Part, clustered_covariance
+from eschorty_ros.surfaces.plane import COMMON_SHARE, CUT_SIGMA, MAD, Part, clustered_covariance
 from eschorty_ros.surfaces.profiles import period_s
+
+if TYPE_CHECKING:
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import cKDTree
 
 POINTS_MAX = 60_000
 _PAIRS_MIN = 200
-_ROUNDS, _ITERATIONS = 4, 60
+_ROUNDS, _ITERATIONS = 4, 15
+_CONVERGED_SIGMAS = 0.01
 # Neighbours of a normal; its noise must not look like the relief of the surface.
 _NORMAL_NEIGHBOURS = 150
 _RELIEF_MIN = 4.0
@@ -38,11 +43,11 @@ class Pose(NamedTuple):
     """Shape (6, 6). Of the rotation about x, y, z (rad) and of the translation along x, y, z
     (mm)."""
     pairs: int
-    """Points with a partner."""
+    """Points on the first cloud's surface."""
     overlap: float
-    """Share of the points with a partner."""
+    """Share of the points within reach of it."""
     rms_sigmas: float
-    """Root mean square distance of the pairs along the normal over its own sigma."""
+    """Root mean square distance of the points along the normal over its own sigma."""
 
     @property
     def rotation_deg(self) -> Array:
@@ -66,11 +71,35 @@ class Pose(NamedTuple):
 
 
 class _Shape(NamedTuple):
-    """Points for ICP: Open3D's cloud in mm from an origin, their grid's cells, normals."""
+    """Points for ICP, in mm from an origin, and the normals there."""
 
-    cloud: Any
     part: Part
     normals: Array
+
+
+class _Surface(NamedTuple):
+    """The first cloud's points over y and z: a tree of them, and x, normal, sigma between them."""
+
+    places: cKDTree
+    between: LinearNDInterpolator
+
+
+class _Pairs(NamedTuple):
+    """Points of the other cloud on the first one's surface, as a linear fit of a pose."""
+
+    ours: NDArray[np.int64]
+    """Shape (n,). Index of the point."""
+    moved: Array
+    """Shape (n, 3). Its place in the frame of the first cloud, mm."""
+    design: Array
+    """Shape (n, 6). Derivatives of the residual by a small rotation about `centre` and a shift."""
+    residual: Array
+    sigma: Array
+    """Shape (n,). Distance along the normal, and its standard deviation, mm."""
+    centre: Array
+    normal_noise: float
+    """Standard deviation of a component of the normals."""
+    overlap: float
 
 
 def register(
@@ -81,12 +110,12 @@ def register(
 ) -> Pose:
     """Return the pose of ``other`` in the frame of ``first``.
 
-    Generalised ICP (Segal, Haehnel and Thrun, 2009) with the covariance of each point: its own
-    sigma along the range, free along the surface.
+    ICP along the mean normal of both clouds (Rusinkiewicz, "A symmetric objective function for
+    ICP", ACM Trans. Graph. 38, 2019), weighted with the points' own sigmas.
 
     - ``first``, ``other``: POINT_DTYPE.
     - ``start``: Shape (4, 4). First guess, metres.
-    - ``reach_mm``: Farthest partner of the first round; each further round halves it.
+    - ``reach_mm``: Farthest from the surface in the first round; each further round halves it.
 
     Raises ``ArgumentError`` when the clouds do not overlap, or slide or turn on each other. Raises
     ``EschortyError`` without Open3D.
@@ -95,23 +124,19 @@ def register(
     open3d = load_open3d("registration")
     origin = np.array([np.median(first[axis]) for axis in "xyz"], np.float64) * 1e3
     target, source = (_shape(open3d, points, origin) for points in (first, other))
+    surface = _surface(target)
     transform = _about(np.eye(4) if start is None else start, origin)
-    methods = open3d.pipelines.registration
-    criteria = methods.ICPConvergenceCriteria(max_iteration=_ITERATIONS)
     reach = reach_mm
     for _ in range(_ROUNDS):
-        result = methods.registration_generalized_icp(
-            source.cloud, target.cloud, reach, transform,
-            methods.TransformationEstimationForGeneralizedICP(), criteria,
-        )  # fmt: skip
-        if len(result.correspondence_set) < _PAIRS_MIN:
-            raise ArgumentError(
-                f"{len(result.correspondence_set):,} points of the clouds are within {reach:g} mm; "
-                "give clouds that overlap, a start nearer to it, or a wider reach"
-            )
-        transform = np.asarray(result.transformation)
+        for _ in range(_ITERATIONS):
+            pairs = _paired(surface, source, transform, reach)
+            scaled = pairs.design / pairs.sigma[:, None]
+            step = np.linalg.lstsq(scaled, -pairs.residual / pairs.sigma, rcond=None)[0]
+            transform = _moved(transform, np.asarray(step, np.float64), pairs.centre)
+            if np.linalg.norm(scaled @ step) < _CONVERGED_SIGMAS:
+                break
         reach *= 0.5
-    return _pose(target, source, transform, np.asarray(result.correspondence_set), origin)
+    return _pose(source, transform, pairs, origin)
 
 
 def join(first: NDArray[np.void], other: NDArray[np.void], pose: Pose) -> NDArray[np.void]:
@@ -150,67 +175,100 @@ def _about(transform: Array, origin_mm: Array) -> Array:
     return moved
 
 
+def _moved(transform: Array, step: Array, centre: Array) -> Array:
+    """Return a transform followed by a rotation (rad) about a centre and a shift."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = transform.copy()
+    moved[:3, :3] = turn @ transform[:3, :3]
+    moved[:3, 3] = turn @ (transform[:3, 3] - centre) + centre + step[3:]
+    return moved
+
+
 def _shape(open3d: Any, points: NDArray[np.void], origin_mm: Array) -> _Shape:
     part = Part.of(grid := organise(points), grid.known)
-    keep = slice(None, None, math.ceil(len(part.line) / POINTS_MAX))
-    part = part.select(keep)
-    xyz = part.xyz - origin_mm
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz))
+    part = part.select(slice(None, None, math.ceil(len(part.line) / POINTS_MAX)))
+    part = part._replace(xyz=part.xyz - origin_mm)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(part.xyz))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     normals = np.asarray(cloud.normals)
-    normals *= -np.sign(normals[:, :1])
-    # The radius of that many neighbours on an area.
-    area = np.ptp(xyz[:, 1]) * np.ptp(xyz[:, 2]) / len(xyz)
-    radius = math.sqrt(_NORMAL_NEIGHBOURS * area / math.pi)
-    along = np.maximum(np.abs(normals[:, 0]) * part.sigma, 1e-3 * part.sigma)
-    # Free along the surface: far beyond both sigma and spacing.
-    free = (3.0 * radius) ** 2
-    outer = np.einsum("ni,nj->nij", normals, normals)
-    spread = free * (np.eye(3) - outer) + (along**2)[:, None, None] * outer
-    cloud.covariances = open3d.utility.Matrix3dVector(spread)
-    return _Shape(cloud, part, normals)
+    return _Shape(part, normals * -np.sign(normals[:, :1]))
 
 
-def _pose(
-    target: _Shape, source: _Shape, transform: Array, pairs: NDArray[np.int64], origin_mm: Array
-) -> Pose:
-    ours, theirs = pairs[:, 0], pairs[:, 1]
+def _surface(shape: _Shape) -> _Surface:
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import QhullError, cKDTree
+
+    part = shape.part
+    values = np.column_stack([part.xyz[:, 0], shape.normals, part.sigma])
+    try:
+        between = LinearNDInterpolator(part.xyz[:, 1:], values)
+    except QhullError as error:
+        raise ArgumentError("the first cloud is a line; give a cloud of a sweep") from error
+    return _Surface(cKDTree(part.xyz[:, 1:]), between)
+
+
+def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float) -> _Pairs:
+    """Return the points within reach of the surface, outliers left out.
+
+    They meet it at their own y and z. The nearest point in space would be one of a similar error of
+    the range, and any point instead of a place draws the clouds onto each other's grid.
+    """
     turn = transform[:3, :3]
-    moved = np.asarray(source.cloud.points)[ours] @ turn.T + transform[:3, 3]
-    fixed = np.asarray(target.cloud.points)[theirs]
-    turned = source.normals[ours] @ turn.T
-    normals = target.normals[theirs]
+    moved = source.part.xyz @ turn.T + transform[:3, 3]
+    aside, _ = surface.places.query(moved[:, 1:], distance_upper_bound=reach_mm)
+    ours = np.flatnonzero(np.isfinite(aside))
+    fixed = surface.between(moved[ours, 1:])
+    inside = np.isfinite(fixed[:, 0])
+    ours, fixed = ours[inside], fixed[inside]
+    moved = moved[ours]
+    turned, normals = source.normals[ours] @ turn.T, fixed[:, 1:4]
     turned *= np.sign(np.sum(turned * normals, axis=1))[:, None]
-    # The normals of one place in both clouds differ by their noise; half of it is in their mean.
-    noise = MAD * float(np.median(np.abs(turned - normals)[:, 1:])) / 2.0
+    difference = np.abs(turned - normals)[:, 1:]
     normals = normals + turned
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    residual = np.sum(normals * (moved - fixed), axis=1)
-    range_axis = turn[:, 0]
-    sigma = np.hypot(
-        target.part.sigma[theirs] * normals[:, 0], source.part.sigma[ours] * (normals @ range_axis)
+    residual = normals[:, 0] * (moved[:, 0] - fixed[:, 0])
+    sigma = np.hypot(fixed[:, 4] * normals[:, 0], source.part.sigma[ours] * (normals @ turn[:, 0]))
+    # Cut along the normal, and not within the noise: else the cut itself holds the points.
+    near = np.abs(residual) <= np.maximum(reach_mm, CUT_SIGMA * sigma)
+    found = np.count_nonzero(near)
+    if found < _PAIRS_MIN:
+        raise ArgumentError(
+            f"{found:,} points of the clouds are within {reach_mm:g} mm; give clouds that "
+            "overlap, a start nearer to it, or a wider reach"
+        )
+    # The normals of one place in both clouds differ by their noise; half of it is in their mean.
+    noise = MAD * float(np.median(difference[near])) / 2.0
+    ratio = np.abs(residual) / sigma
+    near &= ratio <= CUT_SIGMA * max(MAD * float(np.median(ratio[near])), 1.0)
+    ours, moved, normals, residual, sigma = (
+        v[near] for v in (ours, moved, normals, residual, sigma)
     )
-    near = np.abs(residual) <= 4.0 * np.sqrt(np.mean((residual / sigma) ** 2)) * sigma
-    moved, normals, residual, sigma = (v[near] for v in (moved, normals, residual, sigma))
-    ours = ours[near]
     centre = moved.mean(axis=0)
     design = np.column_stack([np.cross(moved - centre, normals), normals])
-    _refuse_sliding(design, sigma, noise)
-    part = Part(source.part.line[ours], source.part.column[ours], moved, sigma)
-    covariance = clustered_covariance(design, residual, part)
-    common = COMMON_SHARE * float(np.median(sigma))
-    extent = np.ptp(moved, axis=0)
+    overlap = found / len(source.part.line)
+    return _Pairs(ours, moved, design, residual, sigma, centre, noise, overlap)
+
+
+def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> Pose:
+    _refuse_sliding(pairs.design, pairs.sigma, pairs.normal_noise)
+    line, column = source.part.line[pairs.ours], source.part.column[pairs.ours]
+    part = Part(line, column, pairs.moved, pairs.sigma)
+    covariance = clustered_covariance(pairs.design, pairs.residual, part)
+    common = COMMON_SHARE * float(np.median(pairs.sigma))
+    extent = np.ptp(pairs.moved, axis=0)
     shared = np.array([0.0, common / extent[2], common / extent[1], common, 0.0, 0.0])
     covariance += np.diag(shared**2)
     metres = transform.copy()
-    metres[:3, 3] = (transform[:3, 3] + origin_mm - turn @ origin_mm) * 1e-3
+    metres[:3, 3] = (transform[:3, 3] + origin_mm - transform[:3, :3] @ origin_mm) * 1e-3
     return Pose(
         metres,
-        centre + origin_mm,
+        pairs.centre + origin_mm,
         covariance,
-        len(ours),
-        len(pairs) / len(source.part.line),
-        float(np.sqrt(np.mean((residual / sigma) ** 2))),
+        len(pairs.ours),
+        pairs.overlap,
+        float(np.sqrt(np.mean((pairs.residual / pairs.sigma) ** 2))),
     )
 
 

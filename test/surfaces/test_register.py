@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from grid_clouds import cloud, moved
+from grid_clouds import PITCH_Y, cloud, moved
 from scipy.spatial.transform import Rotation
 
 from eschorty_ros.cli import main
@@ -46,6 +46,18 @@ def test_known_poses_are_within_the_reported_covariance():
         assert pose.overlap > 0.9
     assert np.mean(np.abs(ratios) < 2.0) > 0.93
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_a_shift_by_half_a_pitch_is_not_drawn_to_the_grid():
+    """Of two partners equally far the one with a similar error of the range must not count more."""
+    first = cloud(relief, smooth=1, seed=20)
+    half_mm = PITCH_Y / 2.0
+    other = cloud(lambda y, z: relief(y + half_mm, z), smooth=1, seed=21)
+    pose = register(first, other, reach_mm=5.0)
+    error = pose.shift_mm - [0.0, half_mm, 0.0]
+    print(f"seeds 20, 21: {error} mm, {error / pose.sigmas[3:]} sigma")
+    assert np.abs(error / pose.sigmas[3:]).max() < 2.0
+    assert np.abs(error).max() < 0.02
 
 
 @pytest.mark.parametrize(
