@@ -50,9 +50,9 @@ def command(
 ) -> None:
     """Measure planes in CLOUD (.pcd or .ply of this package), every value with its sigma.
 
-    Each surface gets a plane: range at its middle, slopes, and flatness (peak to valley of 8 by 8
-    cells; a perfect plane shows some at this noise, too). Sigmas hold the scatter, correlations and
-    a common error, not the calibration's. Every further surface is measured
+    Each surface gets a plane: range at its middle, slopes, and flatness (peak to valley of up to
+    8 by 8 cells; a perfect plane shows some at this noise, too). Sigmas hold the scatter,
+    correlations and a common error, not the calibration's. Every further surface is measured
     against the first one: distance (of two parallel planes), angle, flush (step where the two face
     each other) and gap (space between the facing edges; along the sweep the laser line's thickness
     shifts an edge by up to half of it).
@@ -127,15 +127,15 @@ def _text(value: Value) -> str:
 
 def _print(measured: Measured, title: str) -> None:
     first = table(
-        title, "surface", "points", "range mm", "slope y", "slope z", "rms mm", "flatness mm",
-        "if perfect",
+        title, "surface", "points", "left out", "range mm", "slope y", "slope z", "rms mm",
+        "flatness mm", "if perfect",
     )  # fmt: skip
     for number, surface in enumerate(measured.surfaces, 1):
         plane, flat = surface.plane, surface.flat
         first.add_row(
-            str(number), f"{len(surface.part.line):,}", _text(surface.range_mm),
-            _text(plane.slope(0)), _text(plane.slope(1)), f"{plane.rms_mm:.2f}",
-            _text(flat.value_mm), f"{flat.of_plane_mm:.2f}",
+            str(number), f"{len(surface.part.line):,}", f"{int((~plane.kept).sum()):,}",
+            _text(surface.range_mm), _text(plane.slope(0)), _text(plane.slope(1)),
+            f"{plane.rms_mm:.2f}", _text(flat.value_mm), f"{flat.of_plane_mm:.2f}",
         )  # fmt: skip
     show(first)
     bent = [str(n) for n, surface in enumerate(measured.surfaces, 1) if surface.flat.of_no_plane]

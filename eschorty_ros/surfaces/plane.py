@@ -3,7 +3,7 @@
 Neighbouring points share errors: smoothing over columns, the pattern of the pixels, the phase of a
 period. The covariance is clustered by strips of columns, by strips of lines and by both (Cameron,
 Gelbach and Miller, "Robust inference with multiway clustering", J. Bus. Econ. Stat. 29, 2011), and
-nowhere below that of independent errors of the points' own sigmas.
+nowhere below that of one kind of strips or that of independent errors of the points' own sigmas.
 """
 
 from __future__ import annotations
@@ -154,11 +154,14 @@ def clustered_covariance(design: Array, residual: Array, part: Part) -> Array:
     lines = _strips(part.line, _STRIP_LINES)
     columns = _strips(part.column, _STRIP_COLUMNS)
     both = lines * (int(columns.max()) + 1) + columns
-    spread = _spread(score, lines) + _spread(score, columns) - _spread(score, both)
+    down, aside = _spread(score, lines), _spread(score, columns)
     root = np.linalg.cholesky(own)
-    factors, axes = np.linalg.eigh(root.T @ spread @ root)
-    turned = root @ axes
-    return np.asarray((turned * np.maximum(factors, 1.0)) @ turned.T)
+    # At least that of independent errors, and that of either kind of strips alone.
+    least = np.eye(len(own))
+    for spread in (down, aside, down + aside - _spread(score, both)):
+        factors, axes = np.linalg.eigh(root.T @ spread @ root - least)
+        least = least + (axes * np.maximum(factors, 0.0)) @ axes.T
+    return np.asarray(root @ least @ root.T)
 
 
 def _strips(number: NDArray[np.int64], width: int) -> NDArray[np.int64]:
@@ -192,7 +195,7 @@ def check_part(part: Part) -> None:
 
 
 def flatness(part: Part, plane: Plane) -> Flatness:
-    """Return the flatness of a part about its plane; NaN when it is too small for two cells."""
+    """Return the flatness of a part about its plane; NaN when it is too small for four cells."""
     line, column = part.line[plane.kept], part.column[plane.kept]
     residual = plane.residual[plane.kept]
     fine = 4
@@ -203,7 +206,8 @@ def flatness(part: Part, plane: Plane) -> Flatness:
     used = count >= 0.25 * np.median(count[count > 0])
     own = np.bincount(cells, part.sigma[plane.kept] ** 2, total) / np.maximum(count, 1) ** 2
     variance = own * max(1.0, *(_excess(residual, at, cells, used, own) for at in (down, aside)))
-    if np.count_nonzero(used) < 2:
+    # A plane follows three cells by itself.
+    if np.count_nonzero(used) < 4:
         return Flatness(Value(np.nan, np.nan), np.nan)
     from scipy.special import ndtri
 
@@ -222,10 +226,12 @@ def _cells(
 ) -> NDArray[np.int64]:
     """Return the cell of every point, of 8 x 8 times ``fine``."""
     parts = []
-    for number, times in zip((line, column), fine, strict=True):
+    for number, times, strip in zip(
+        (line, column), fine, (_STRIP_LINES, _STRIP_COLUMNS), strict=True
+    ):
         first, span = int(number.min()), int(np.ptp(number)) + 1
-        # No cell is narrower than 4 lines or columns, so that it can be divided.
-        coarse = min(_FLAT_CELLS, max(span // 4, 1))
+        # Two strips: a cell is divided, and neighbours' errors are alike.
+        coarse = min(_FLAT_CELLS, max(span // (2 * strip), 1))
         parts.append(((number - first) * coarse * times // span, coarse * times))
     (down, _), (aside, width) = parts
     return down * width + aside

@@ -66,6 +66,20 @@ def test_the_sigma_of_a_plane_follows_the_errors_that_neighbours_share(smooth):
         assert 0.75 < seen / stated < 1.3, axis
 
 
+def test_small_parts_of_a_plane_are_no_bent_ones():
+    """The pixels' pattern, the same in every period and alike in 17 columns; seeds 0 to 11."""
+    parts, bent = (Region((100, 299), (5.0, 25.0)), Region((100, 214), (5.0, 15.0))), 0
+    for seed in range(12):
+        noise = np.random.default_rng(seed).normal(0.0, 0.15 * np.sqrt(17.0), 416)
+        pattern = np.convolve(noise, np.full(17, 1.0 / 17.0), "valid")
+        points = cloud(lambda y, z, p=pattern: 1300.0 + p + 0.0 * y, 0.08, smooth=17, seed=seed)
+        points["sigma"] = 0.17e-3
+        flats = [surface.flat for surface in measure(points, parts).surfaces]
+        bent += sum(flat.of_no_plane for flat in flats)
+        assert np.isfinite([flat.of_plane_mm for flat in flats]).tolist() == [True, False]
+    assert bent == 0
+
+
 def test_surfaces_gap_step_and_flatness_are_found_without_regions():
     """Two panels, 10 mm apart along z, one 4 mm farther and with a dent of 1.5 mm."""
 
