@@ -291,7 +291,7 @@ def _known(distances: str | None, range_sigma: float) -> list[KnownTarget]:
     if distances is None:
         return read_distances(config_file("posts.csv"))
     try:
-        ranges = [float(part) for part in distances.split(",")]
+        ranges = [float(part) for part in distances.rstrip(", ").split(",")]
     except ValueError:
         return read_distances(distances, sigma_range_mm=range_sigma)
     return [KnownTarget(range_mm, range_sigma) for range_mm in ranges]

@@ -56,19 +56,21 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
 
     Raises ``ArgumentError`` when no two periods have a point, or the grid would be too large.
     """
+    whole = _on_one_surface(points)
     kept = np.flatnonzero(
         np.all([np.abs(points[axis]) < 1e6 for axis in "xyz"], axis=0)
         & (np.abs(points["t"]) < 1e9)
         & (points["sigma"] > 0.0)
         & (points["sigma"] < 1e6)
-        & _on_one_surface(points)
+        & whole
     )
     chosen = points[kept]
     period = period_s(chosen) if len(chosen) else float("nan")
     if not period > 0.0:
         raise ArgumentError(
             f"the cloud has {len(chosen):,} points with place, time and sigma in fewer than two "
-            "modulation periods; give a cloud of a sweep"
+            f"modulation periods, {np.count_nonzero(~whole):,} more with the flag mixed or "
+            "sensor_edge; give a cloud of a sweep"
         )
     line = profile_index(chosen, period)
     first = int(chosen["column"].min())

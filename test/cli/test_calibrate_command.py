@@ -96,7 +96,7 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
     )  # fmt: skip
     distances = ",".join(str(post.range_mm) for post in posts)
     out, options = tmp_path / "made.yaml", (tmp_path / "rec", "--range-sigma", 0.1, "--distances")
-    after = rms_mm(made_by(out, *options, distances), AS_BUILT)
+    after = rms_mm(made_by(out, *options, f"{distances},"), AS_BUILT)
     before = rms_mm(NOMINAL, AS_BUILT)
     print(f"seed {SEED}: range RMS {after:.2f} mm, {before:.1f} mm before")
     assert after < 1.0 < 20.0 < before

@@ -13,6 +13,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import write_cloud
+from eschorty_ros.core.storage.cloud import SENSOR_EDGE
 from eschorty_ros.simulation.scenes import Steps
 from eschorty_ros.simulation.world import simulate_recording
 from eschorty_ros.surfaces.measure import Region, measure, parse_region
@@ -112,6 +113,10 @@ def test_a_cloud_without_surfaces_and_bad_regions_have_one_line():
         measure(points, (parse_region("1000:,:"),))
     with pytest.raises(ArgumentError, match="give a cloud of a sweep"):
         measure(points[points["t"] == 0.0])
+    points["flags"] = SENSOR_EDGE
+    with pytest.raises(ArgumentError, match=r"24,000 more with the flag mixed or sensor_edge"):
+        measure(points)
+    points["flags"] = 0
     points["x"] = np.random.default_rng(0).uniform(1.0, 2.0, len(points))
     with pytest.raises(ArgumentError, match="choose regions"):
         measure(points)

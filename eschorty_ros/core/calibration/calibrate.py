@@ -157,7 +157,7 @@ def calibrate(
     priors = _priors(method, prior_sigma, names, design)
     check_targets(targets, design, names)
     _refuse_pairs(targets, design)
-    _refuse_undetermined(targets, names)
+    _refuse_undetermined(targets, design, names)
     used = np.ones(len(targets), dtype=bool)
     rejected: tuple[Rejected, ...] = ()
     if _rejects_outliers(method, robust, len(targets)):
@@ -249,18 +249,19 @@ def _refuse_pairs(targets: Targets, design: RangeModel) -> None:
                 )
 
 
-def _refuse_undetermined(targets: Targets, names: tuple[str, ...]) -> None:
+def _refuse_undetermined(targets: Targets, design: RangeModel, names: tuple[str, ...]) -> None:
     distinct = np.unique(targets.range_mm).size
     if distinct < 2:
         raise FitError(
             f"range_mm holds {distinct} different ranges (condition number inf); give targets at "
             "2 different ranges or more"
         )
-    span, sigma = float(np.ptp(targets.range_mm)), float(np.max(targets.sigma_range_mm))
+    # One target of a large error is no reason: the others determine the build.
+    span, sigma = float(np.ptp(targets.range_mm)), float(np.median(targets.sigma_range_mm))
     if span < _SPAN_SIGMAS * sigma:
         raise FitError(
             f"the targets do not determine the build: their ranges differ by {span:g} mm and have "
-            f"a sigma of {sigma:g} mm; give targets that move in range"
+            f"a sigma of {sigma:g} mm; {_remedy(targets, design)}"
         )
     if set(names) == {WIDTH_BIAS}:
         raise ArgumentError(
@@ -289,8 +290,15 @@ def _refuse_unmoved(kept: Targets, design: RangeModel, found: CalibrationFit) ->
     raise FitError(
         f"the targets do not determine the build: rows {kept.row.min():.1f} to "
         f"{kept.row.max():.1f} at {low:g} to {high:g} mm, a difference of {expected:.1f} px by the "
-        f"design, would be k_prime_px = {model.k_prime_px:.4g}; give targets that move in range"
+        f"design, would be k_prime_px = {model.k_prime_px:.4g}; {_remedy(kept, design)}"
     )
+
+
+def _remedy(targets: Targets, design: RangeModel) -> str:
+    near_mm, far_mm = design.range_limits_mm
+    if targets.range_mm.max() < near_mm:
+        return f"give range_mm in millimetres, {near_mm:.0f} to {far_mm:.0f} by the design"
+    return "give targets that move in range"
 
 
 def _rejects_outliers(method: Method, robust: bool | None, size: int) -> bool:

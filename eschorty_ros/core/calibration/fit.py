@@ -316,6 +316,8 @@ def refuse_singular(problem: Problem, values: Mapping[str, float]) -> None:
         )
     elif WIDTH_BIAS in names - priors and not sized:
         remedy = "only targets of known size show a width bias: give sizes or fix width_bias_px"
+    elif len(np.unique(observed.column_u)) <= len(set(COLUMN_TERMS) & names - priors):
+        remedy = f"give targets in different columns or fix {' and '.join(COLUMN_TERMS)}"
     else:
         remedy = f"give targets at {max(len(names - priors), 2)} different ranges or more"
     raise FitError(

@@ -101,7 +101,7 @@ def _cut(
         better = observed.known & kept[:, None] if kept.any() else observed.known
         scale = _scale(distance, better)
         before, kept = kept, np.abs(distance).max(axis=1) <= _CUT_SIGMA * scale
-        _refuse_contradictions(kept, scale, observed)
+        _refuse_contradictions(kept, scale, observed, _check(distance, observed.known))
         if np.array_equal(kept, before):
             break
         part = Problem(observed.select(kept), design, names, priors, values)
@@ -121,15 +121,26 @@ def _scale(distance: Array, known: Mask) -> float:
     return max(1.0, _MAD * float(np.median(np.abs(distance[known]))))
 
 
-def _refuse_contradictions(kept: Mask, scale: float, observed: Observed) -> None:
+def _check(distance: Array, known: Mask) -> str:
+    """Return what to check: that of the channel with the largest median residual."""
+    medians = [
+        float(np.median(np.abs(distance[used, channel]))) if used.any() else 0.0
+        for channel, used in enumerate(known.T)
+    ]
+    return (
+        "ranges, which target is which and sigma_row_px",
+        "width_px and size_mm",
+        "spacing_px and spacing_mm",
+    )[int(np.argmax(medians))]
+
+
+def _refuse_contradictions(kept: Mask, scale: float, observed: Observed, check: str) -> None:
     if scale > _SCALE_MAX:
         raise FitError(
             f"the targets contradict each other: even the better half is {scale:.0f} times "
-            "farther from any curve than their sigmas allow; check ranges, which target is which "
-            "and sigma_row_px"
+            f"farther from any curve than their sigmas allow; check {check}"
         )
     if 2 * int(kept.sum()) <= len(observed) or np.ptp(observed.range_mm[kept]) == 0.0:
         raise FitError(
-            f"only {int(kept.sum())} of {len(observed)} targets follow one curve; check their "
-            "ranges and which target is which"
+            f"only {int(kept.sum())} of {len(observed)} targets follow one curve; check {check}"
         )

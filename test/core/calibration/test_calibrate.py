@@ -194,6 +194,31 @@ def test_targets_that_determine_no_build_are_refused_with_the_cause():
     refused(FitError, Targets(targets.row[::-1], targets.range_mm), match="no two targets")
 
 
+def test_a_refusal_names_what_is_wrong():
+    targets = posts(size_mm=TWO_SIZES_MM)
+
+    def given(**changes):
+        names = ("row", "range_mm", "width_px", "size_mm")
+        return Targets(**({name: getattr(targets, name) for name in names} | changes))
+
+    for share in (0.001, 1 / 25.4, 0.5):
+        wrong = given(size_mm=TWO_SIZES_MM * share)
+        refused(FitError, wrong, match="check width_px and size_mm")
+    for share in (0.001, 1 / 25.4, 0.1):
+        wrong = Targets(targets.row, targets.range_mm * share, sigma_range_mm=1.0)
+        refused(FitError, wrong, match="give range_mm in millimetres, 785 to 2116")
+    same, free = given(column=640.0), ("k_prime_px", "b_prime_px", "b_prime_1_px")
+    none = dict.fromkeys(("b_prime_px", "b_prime_1_px"), math.inf)
+    refused(FitError, same, free=free, prior_sigma=none, match="give targets in different columns")
+
+
+def test_one_target_of_a_large_error_does_not_block_the_others():
+    targets = posts()
+    sigma = np.where(np.arange(9) == 8, 500.0, 1.0)
+    found = calibrate(Targets(targets.row, targets.range_mm, 0.3, sigma), NOMINAL)
+    assert np.abs(found.fit.model.range_mm(TRUTH.row(NINE_MM[:8])) - NINE_MM[:8]).max() < 4.0
+
+
 def test_options_that_exclude_each_other_are_refused():
     targets = posts()
     refused(ArgumentError, targets, "paper", free=("b_mm",), match="method paper fits")
