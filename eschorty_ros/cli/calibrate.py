@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import pairs, progress_bar, show, table
+from eschorty_ros.cli.console import pairs, progress_bar, show, table, warn
 from eschorty_ros.cli.files import OUT_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import Number, refuse_given
@@ -261,6 +261,11 @@ def _recorded(
     from eschorty_ros.core.storage import load_recording
 
     recording = load_recording(source)
+    if recording.calibration.name != design.name:
+        warn(
+            f"{source} is of the build {recording.calibration.name} and --nominal of "
+            f"{design.name}; give the design that made it"
+        )
     with progress_bar("reading") as report:
 
         def progress(done: int, total: int) -> None:

@@ -121,6 +121,10 @@ def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
             speed_mm_s=200.0, seed=SEED,
         )  # fmt: skip
     options = ("--moving", 1500.0, "--nominal", tmp_path / "nominal.yaml")
+    other = tmp_path / "other.yaml"
+    save_calibration(replace(nominal, name="bench_2"), other)
+    warned = run(*folders, *options[:2], "--nominal", other, "--out", tmp_path / "other_made.yaml")
+    assert warned.stderr.count("is of the build config_3 and --nominal of bench_2") == 2
     made = made_by(tmp_path / "made.yaml", *folders, *options)
     error = made.model().range_mm(as_built.model().row([1520.0, 1800.0])) - [1520.0, 1800.0]
     print(f"seed {SEED}: range error {error} mm at 1520 and 1800 mm")
