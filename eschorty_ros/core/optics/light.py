@@ -75,8 +75,10 @@ def photons_per_column(
     - ``power_mw``, ``wavelength_nm``: Of the light.
     - ``seconds``: Time of light, such as half a modulation period.
     """
-    depth_mm = positive("range_mm + b_mm", range_mm + build.model.b_mm)
+    positive("range_mm + b_mm", range_mm + build.model.b_mm)
+    along_mm, beside_mm = build.model.pupil_mm
+    lens_mm = math.hypot(range_mm - along_mm, beside_mm)
     energy_j = power_mw * 1e-3 * positive("seconds", seconds) / build.model.columns
     aperture_mm = build.focal_length_mm / build.f_number
-    collected = (0.5 * aperture_mm / depth_mm) ** 2
+    collected = (0.5 * aperture_mm / lens_mm) ** 2
     return energy_j * min(collected, 1.0) * positive("wavelength_nm", wavelength_nm) / _JOULE_NM

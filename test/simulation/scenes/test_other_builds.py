@@ -99,8 +99,11 @@ def test_light_follows_the_inverse_square_and_errors_name_the_argument():
         focal_length_mm=24.0, f_number=2.0, theta_deg=85.87, theta_prime_deg=-7.62, near_mm=784.6
     )
     near, far = (photons_per_column(build, r, 40.0, 450.0, 7e-3) for r in (1000.0, 2000.0))
-    assert near / far == pytest.approx(4.0)
+    # The lens is 0.18 m beside the sheet, so farther from the target than the range.
+    along_mm, beside_mm = build.model.pupil_mm
+    lens_mm = np.hypot(np.array([1000.0, 2000.0]) - along_mm, beside_mm)
+    assert near / far == pytest.approx((lens_mm[1] / lens_mm[0]) ** 2)
     # 40 mW over 1280 columns for 7 ms are 0.22 uJ; (6 mm / 1 m)^2 of it at 0.44 aJ a photon.
-    assert near == pytest.approx(1.78e7, rel=0.01)
+    assert near * (lens_mm[0] / 1000.0) ** 2 == pytest.approx(1.78e7, rel=0.01)
     with pytest.raises(ArgumentError, match="wavelength_nm is 1550"):
         laser_class(1.0, 1550.0, 0.0)
