@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import decimals, show, table
-from eschorty_ros.cli.files import OUT_FILE
-from eschorty_ros.cli.options import Number
+from eschorty_ros.cli.files import OUT_FILE, report_replaced
+from eschorty_ros.cli.options import Number, refuse_given
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,6 +94,8 @@ def command(
 
     from eschorty_ros.core.optics import design, design_for_ranges, save_calibration
 
+    if power_mw is None:
+        refuse_given(["wavelength_nm"], "belongs to --power-mw")
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
     given: dict[str, Any] = {
@@ -123,6 +125,7 @@ def command(
         click.echo(light)
     for out in outs:
         if out.suffix in (".yaml", ".yml"):
+            report_replaced(out)
             save_calibration(build.calibration(out.stem), out)
         else:
             _draw(build, np.linspace(near, last, 400), out)

@@ -118,6 +118,7 @@ def test_help_imports_nothing_heavy():
         ("info", "/nowhere"),
         ("simulate", "--frequency", "fast", "--out", "x"),
         ("design", "--theta-prime-deg", "-7", "--far-mm", "2000"),
+        ("design", "--wavelength-nm", "905"),
         ("view", __file__, "--browser", "--out", "x.png"),
         ("view", __file__, "--port", "9000"),
         ("scan", "--hardware", __file__, "--scene", "sphere"),
@@ -449,6 +450,12 @@ def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
     assert "810.5 to 2404.8 mm" in output
     assert "mm/row" in output
     assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_design_reports_the_calibration_that_it_replaces(tmp_path):
+    out = tmp_path / "made.yaml"
+    assert "is replaced" not in run("design", "--out", out).stderr
+    assert "is replaced" in run("design", "--out", out).stderr
 
 
 def test_design_finds_the_tilt_for_two_ranges():
