@@ -182,18 +182,19 @@ def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[
 def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
     """Return lines about ranges that the targets do not cover or cover too thinly."""
     model, lines = found.model, []
+    near, far = model.range_limits_mm
     first, last = float(targets.row.min()), float(targets.row.max())
     margin = _MARGIN * model.rows
     if first > margin or last < model.rows - 1 - margin:
-        ends = np.array([0.0, model.rows - 1.0])
-        near, far = model.range_mm(ends)
-        worst = np.nanmax(found.range_sigma_mm([near, far]))
+        if math.isfinite(far):
+            worst = found.range_sigma_mm([near, far]).max()
+            covered = f"{near:.0f} to {far:.0f} mm, where sigma grows to {worst:.2g} mm"
+        else:
+            covered = f"{near:.0f} mm to infinity, where sigma grows without limit"
         lines.append(
             f"extrapolates outside {targets.range_mm.min():.0f} to {targets.range_mm.max():.0f} mm "
-            f"(rows {first:.0f} to {last:.0f}): the sensor covers {near:.0f} to {far:.0f} mm, "
-            f"where sigma grows to {worst:.2g} mm"
+            f"(rows {first:.0f} to {last:.0f}): the sensor covers {covered}"
         )
-    near, far = model.range_limits_mm
     third = near + (far - near) * 2.0 / 3.0
     beyond = int((targets.range_mm >= third).sum())
     if math.isfinite(third) and beyond < _FAR_SHARE * len(targets):

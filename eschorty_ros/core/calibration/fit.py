@@ -330,13 +330,15 @@ def check_targets(targets: Targets, design: RangeModel, names: tuple[str, ...]) 
     """Refuse no targets, and targets off the sensor or behind the focal line, by name."""
     if not len(targets):
         raise FitError("there are 0 targets (condition number inf); give targets at known ranges")
-    off = (targets.row < -0.5) | (targets.row > design.rows - 0.5)
-    if off.any():
-        at = int(np.flatnonzero(off)[0])
-        raise ArgumentError(
-            f"row of target {targets.labels[at]} is {targets.row[at]:g}; the sensor has rows 0 to "
-            f"{design.rows - 1}"
-        )
+    for name, pixels in (("row", design.rows), ("column", design.columns)):
+        place = getattr(targets, name)
+        off = (place < -0.5) | (place > pixels - 0.5)
+        if off.any():
+            at = int(np.flatnonzero(off)[0])
+            raise ArgumentError(
+                f"{name} of target {targets.labels[at]} is {place[at]:g}; the sensor has {name}s 0 "
+                f"to {pixels - 1}"
+            )
     behind = targets.range_mm + design.b_mm <= 0.0
     if behind.any():
         raise ArgumentError(

@@ -63,6 +63,15 @@ def test_verdicts_name_what_the_targets_leave_open():
     assert "identifiable" not in two.verdicts
 
 
+def test_a_sensor_that_sees_infinity_says_so():
+    """The pole is on the sensor: the last rows have no range."""
+    nominal = replace(NOMINAL, theta_prime_deg=-60.0, k_prime_px=-5702.2, b_prime_px=-274.4)
+    targets = see(np.random.default_rng(SEED), np.linspace(520.0, 3000.0, 9), truth=nominal.model())
+    lines = calibrate(targets, nominal).verdicts
+    assert any("the sensor covers 500 mm to infinity" in line for line in lines)
+    assert not any("nan" in line for line in lines)
+
+
 def test_residuals_larger_than_stated_are_reported():
     targets = posts(ranges_mm=ALL_ROWS_MM)
     understated = Targets(targets.row, targets.range_mm, 0.02, 0.0)
@@ -178,6 +187,8 @@ def test_targets_that_determine_no_build_are_refused_with_the_cause():
         refused(FitError, same_range, method, match="range_mm holds 1 different ranges")
         refused(FitError, Targets([], []), method, match="there are 0 targets")
         refused(FitError, targets.select([0]), method, match="holds 1 different ranges")
+        aside = Targets(targets.row, targets.range_mm, column=12000.0)
+        refused(ArgumentError, aside, method, match="column of target 1 is 12000; the sensor has c")
         off = changed(targets, 3, row=720.0)
         refused(ArgumentError, off, method, match="row of target 4 is 720; the sensor has rows 0")
         twin = Targets.concatenate([targets, targets.select([2])])
