@@ -86,6 +86,15 @@ def test_clouds_apart_are_refused_and_a_start_brings_them_together():
     assert len(lines) == 120
 
 
+def test_a_cloud_of_a_stage_at_rest_has_no_pose():
+    first, line = cloud(relief), cloud(lambda y, z: relief(20.0, z) + 0.0 * y, seed=2)
+    line["y"] = 20e-3
+    with pytest.raises(ArgumentError, match="turns about z on the first one"):
+        register(first, line)
+    with pytest.raises(ArgumentError, match="the first cloud is a line; give a cloud of a sweep"):
+        register(line, first)
+
+
 def test_the_command_joins_clouds(tmp_path):
     true = known_pose(3)
     write_cloud(tmp_path / "a.pcd", cloud(relief, seed=7))
