@@ -3,6 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
+from from_python import from_python
 
 from eschorty_ros.simulation.pixels._response import (
     NOTHING,
@@ -15,6 +16,7 @@ from eschorty_ros.simulation.pixels._response import (
 )
 
 SEED = 25
+advanced, noiseless = from_python(_advanced), from_python(_noiseless)
 TAU_US = 159.0
 SHORT = np.geomspace(1e-18, 1e-3, 40)
 LONG = np.geomspace(1e-3, 1e5, 60)
@@ -45,7 +47,7 @@ def test_step_of_the_photoreceptor(u, settled, steps, follower_us, measured):
         for x in steps:
             t_us = float(x) * TAU_US
             exact_u, exact_y = exact_levels(u, u, settled, follower_us, t_us)
-            ours_u, ours_y = _advanced(Signal(u, u, settled, TAU_US, follower_us), t_us)
+            ours_u, ours_y = advanced(Signal(u, u, settled, TAU_US, follower_us), t_us)
             receptor = max(receptor, relative(ours_u, exact_u))
             follower = max(follower, relative(ours_y, exact_y))
     measured("photoreceptor after a step, relative", receptor, 1e-13)
@@ -66,7 +68,7 @@ def test_nearly_equal_time_constants(apart, measured):
                 exact = mpmath.mpf(0.2) + mpmath.mpf(0.8) * mpmath.exp(-turns) * (1 + turns)
             else:
                 _, exact = exact_levels(1.0, 1.0, 0.2, follower_us, t_us)
-            _, ours = _advanced(Signal(1.0, 1.0, 0.2, TAU_US, follower_us), t_us)
+            _, ours = advanced(Signal(1.0, 1.0, 0.2, TAU_US, follower_us), t_us)
             worst = max(worst, relative(ours, exact))
     measured("follower nearly as slow as the photoreceptor, relative", worst, 1e-13)
 
@@ -74,16 +76,16 @@ def test_nearly_equal_time_constants(apart, measured):
 @pytest.mark.parametrize("t_us", [1e5, 1e9, 1e300])
 @pytest.mark.hard_case(25)
 def test_endless_step_settles_exactly(t_us):
-    assert _advanced(Signal(1.0, 0.9, 0.125, TAU_US, 8.0), t_us) == (0.125, 0.125)
-    assert _advanced(Signal(0.125, 0.2, 1.0, TAU_US, 8.0), t_us) == (1.0, 1.0)
+    assert advanced(Signal(1.0, 0.9, 0.125, TAU_US, 8.0), t_us) == (0.125, 0.125)
+    assert advanced(Signal(0.125, 0.2, 1.0, TAU_US, 8.0), t_us) == (1.0, 1.0)
 
 
 @pytest.mark.hard_case(25)
 def test_many_short_steps_are_one_long_step(measured):
     u = y = 1.0
     for _ in range(100_000):
-        u, y = _advanced(Signal(u, y, 0.2, TAU_US, 8.0), 1e-5 * TAU_US)
-    once = _advanced(Signal(1.0, 1.0, 0.2, TAU_US, 8.0), TAU_US)
+        u, y = advanced(Signal(u, y, 0.2, TAU_US, 8.0), 1e-5 * TAU_US)
+    once = advanced(Signal(1.0, 1.0, 0.2, TAU_US, 8.0), TAU_US)
     error = max(relative(a, b) for a, b in zip((u, y), once, strict=True))
     measured("100 000 steps against one, relative", error, 1e-11)
 
@@ -101,9 +103,7 @@ def test_crossing_is_where_the_step_is_at_the_level(rising, follower_us, measure
             u, settled = (1.0, rng.uniform(0.01, 0.9)) if rising else (rng.uniform(0.01, 0.9), 1.0)
             level = u + share * (settled - u)
             band = (level, 10.0) if rising else (0.0, level)
-            ours_us, polarity = _noiseless(
-                Signal(u, u, settled, TAU_US, follower_us), Levels(*band)
-            )
+            ours_us, polarity = noiseless(Signal(u, u, settled, TAU_US, follower_us), Levels(*band))
             assert polarity == (ON if rising else OFF)
             _, there = exact_levels(u, u, settled, follower_us, ours_us)
             worst = max(worst, relative(there, mpmath.mpf(level)))
@@ -112,5 +112,5 @@ def test_crossing_is_where_the_step_is_at_the_level(rising, follower_us, measure
 
 @pytest.mark.hard_case(25)
 def test_level_out_of_reach_is_no_event():
-    assert _noiseless(Signal(1.0, 1.0, 0.5, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
-    assert _noiseless(Signal(1.0, 1.0, 1.0, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
+    assert noiseless(Signal(1.0, 1.0, 0.5, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
+    assert noiseless(Signal(1.0, 1.0, 1.0, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
