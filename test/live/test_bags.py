@@ -146,12 +146,17 @@ def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source
     np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
 
 
-def test_a_laser_without_a_frequency_is_named(tmp_path, source):
-    messages = bag_messages(source, tmp_path / "bag")
+def write_changed(bag, recording, kind, field, value):
+    """A bag of a recording whose messages of a kind all have this value in a field."""
+    messages = bag_messages(recording, bag.with_name("bag"))
     for message in messages:
-        if message.kind == bag_files.LASER:
-            message.fields.frequency = 0.0
-    write_messages(tmp_path / "off", messages, {})
+        if message.kind == kind:
+            setattr(message.fields, field, value)
+    write_messages(bag, messages, {})
+
+
+def test_a_laser_without_a_frequency_is_named(tmp_path, source):
+    write_changed(tmp_path / "off", source, bag_files.LASER, "frequency", 0.0)
     with pytest.raises(EschortyError, match=r"off: laser/state: .* 0\.0; .* give --freq"):
         bag_to_recording(tmp_path / "off", tmp_path / "rec")
     bag_to_recording(tmp_path / "off", tmp_path / "rec", frequency_hz=70.0)
@@ -162,17 +167,14 @@ def test_losses_of_a_bag_are_one_warning_and_a_scan_without_limits_has_none(tmp_
     write_messages(tmp_path / "lost", messages, {})
     done = CliRunner().invoke(main, ["reconstruct", str(tmp_path / "lost")])
     assert (done.exit_code, done.stderr.count("were lost on the way")) == (0, 1), done.output
-    assert CliRunner().invoke(main, ["convert", *map(str, (tmp_path / "lost", tmp_path / "rec"))])
+    converted = CliRunner().invoke(main, ["convert", f"{tmp_path}/lost", f"{tmp_path}/rec"])
+    assert converted.exit_code == 0, converted.output
     shown = CliRunner().invoke(main, ["info", str(tmp_path / "rec" / "scan.yaml")]).stdout
     assert ("lost" in shown, "mm" in shown) == (True, False)
 
 
 def test_packets_that_the_driver_does_not_number_are_refused(tmp_path, source):
-    messages = bag_messages(source, tmp_path / "bag")
-    for message in messages:
-        if message.kind == bag_files.EVENTS:
-            message.fields.seq = 0
-    write_messages(tmp_path / "same", messages, {})
+    write_changed(tmp_path / "same", source, bag_files.EVENTS, "seq", 0)
     with pytest.raises(EschortyError, match="seq of the event packets does not increase from 0"):
         bag_to_recording(tmp_path / "same", tmp_path / "rec")
 

@@ -61,7 +61,7 @@ def test_blocks_lie_side_by_side(sweeps):
     parts = moving_target(profiles, stage, zero, blocks=4)
     assert len(parts) == pytest.approx(4 * len(one), rel=0.02)
     assert set(np.round(parts.column / 12.0 - 0.48).astype(int)) == {0, 1, 2, 3}
-    # They share the line's lag and the pixels' grid: more of them tell no more about the range.
+    # They share the line's lag and the pixels' grid: more of them add nothing about the range.
     sigmas = [fit(targets, NOMINAL.model()).range_sigma_mm(950.0) for targets in (one, parts)]
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.2)
 

@@ -162,7 +162,7 @@ def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
         wait(says(viewer, "complete"))
 
 
-def test_the_page_shows_who_scans_and_why_the_laser_is_off_until_nobody_reports(world, monkeypatch):
+def test_the_page_shows_who_scans_and_why_the_laser_is_off_until_reports_end(world, monkeypatch):
     monkeypatch.setattr(viewer_module, "_REPORT_TIMEOUT_S", 1.0)
     viewer, instrument = world
     reason = f"treat the laser as on {'-' * 400} by hand"
