@@ -56,7 +56,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-pure test-devices test-scans test-rest test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-pure test-devices test-scans test-nodes test-rest test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -99,24 +99,26 @@ reference: $(SETUP)
 # that stalls fails a scan: what failed runs once more, all of it after a test that hung.
 PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
 DEVICES := $(addprefix test/,hardware nodes/laser nodes/stage)
-SCANS := $(addprefix test/,launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
-REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS))
+SCANS := test/nodes/scanner
+NODES := test/launch test/nodes
+REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS) $(NODES))
 test-%: run = pytest $(tests) -o cache_dir=$(BUILD)/$@
 test-devices: tests := $(DEVICES)
 test-scans: tests := $(SCANS)
+test-nodes: tests := $(NODES) $(addprefix --ignore=,$(DEVICES) $(SCANS))
 test-rest: tests := $(REST)
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
 else
-test: test-scans test-rest
+test: test-scans test-nodes test-rest
 
-test-scans test-rest: test-pure test-devices
+test-scans test-nodes test-rest: test-pure test-devices
 
 test-pure: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
 
-test-devices test-scans test-rest: $(SETUP) $(BUILD)/test.stamp
+test-devices test-scans test-nodes test-rest: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) $(run) --cache-clear || { (($$? == 1)) && echo "Once more:" && $(run) --last-failed; }
 endif
 
