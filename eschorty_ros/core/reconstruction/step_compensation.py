@@ -35,9 +35,6 @@ _WIDTH_GATE_PX = 3.0
 _ROW_GATE_PX = 6.0
 """Rows before and after that differ by more are two surfaces, not a step on one."""
 
-_AHEAD_SHARE = 0.8
-"""Part of the line's width to look ahead: the rest shifts little, and holding back costs time."""
-
 _SIGMA_SHARE = 0.2
 _SIGMA_PX = 0.35
 """Standard deviation of a correction: a share of it, and what half the error of a width gives."""
@@ -63,14 +60,13 @@ class _History(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points of one profile: how many profiles back and ahead a step is off the line.
+    """Points of one profile: how many profiles before and after it a step is off the line.
 
     ``shift_px`` is what the widths say, 0 without a step, and ``difference_px`` what the rows do.
     """
 
     column: NDArray[np.uint16]
-    back: NDArray[np.int64]
-    ahead: NDArray[np.int64]
+    lag: NDArray[np.int64]
     shift_px: Array
     difference_px: Array
 
@@ -95,9 +91,8 @@ class StepCompensator:
         step_mm = abs(settings.stage_speed_mm_s) * modulation.period_us * 1e-6 * self._every
         self._crossing_mm_px = settings.line_width_px / max(step_mm, 1e-9)
         far_mm = model.range_limits_mm[1]
-        back, ahead = self._lags(np.array([far_mm if math.isfinite(far_mm) else 1e6]))
-        self._delay = int(ahead[0])
-        size = int(back[0] + ahead[0]) + 1
+        self._delay = int(self._lags(np.array([far_mm if math.isfinite(far_mm) else 1e6]))[0])
+        size = 2 * self._delay + 1
         self._history = _History(
             present=np.zeros(size, np.bool_),
             widths_px=np.zeros((size, model.columns)),
@@ -168,9 +163,9 @@ class StepCompensator:
         return done
 
     def _corrected(self, number: int, profile: LineRows) -> LineRows:
-        back, ahead = self._lags(self._model.range_mm(profile.row, profile.column))
+        lag = self._lags(self._model.range_mm(profile.row, profile.column))
         shift_px, difference_px = np.zeros((2, len(profile)))
-        points = _Points(profile.column, back, ahead, shift_px, difference_px)
+        points = _Points(profile.column, lag, shift_px, difference_px)
         _shifts(points, self._history, number, self._newest)
         if not shift_px.any():
             return profile
@@ -187,13 +182,11 @@ class StepCompensator:
         left2 = np.maximum(profile.sigma_row**2 - shift_px**2, 0.0)
         return replace(profile, row=profile.row - shift_px, sigma_row=np.sqrt(left2 + added_px**2))
 
-    def _lags(self, range_mm: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return profiles back and ahead until a step at the middle of the line has left it."""
+    def _lags(self, range_mm: Array) -> NDArray[np.int64]:
+        """Return the number of profiles in which a step at the middle of the line leaves it."""
         rows_per_mm = self._model.rows_per_mm_off_sheet(range_mm)
         profiles = np.nan_to_num(self._crossing_mm_px / np.maximum(rows_per_mm, 1e-9), nan=1.0)
-        back = np.clip(np.ceil(profiles), 1, _LAG_MAX).astype(np.int64)
-        ahead = np.clip(np.rint(_AHEAD_SHARE * profiles), 1, _LAG_MAX).astype(np.int64)
-        return back, ahead
+        return np.clip(np.ceil(profiles), 1, _LAG_MAX).astype(np.int64)
 
 
 @kernel
@@ -218,13 +211,13 @@ def _centroid_shift(before, now, after):
 
 
 @kernel
-def _interpolated(row_before, row_after, back, ahead):
-    """Return the row between two neighbours in time, or that of the only one; NaN without any."""
+def _between(row_before, row_after):
+    """Return the mean row of two neighbours in time, or that of the only one; NaN without any."""
     if np.isnan(row_before):
         return row_after
     if np.isnan(row_after):
         return row_before
-    return (row_before * ahead + row_after * back) / (back + ahead)
+    return 0.5 * (row_before + row_after)
 
 
 @kernel
@@ -259,7 +252,7 @@ def _shifts(points, history, number, newest):
     scratch = np.empty(2 * _REACH_COLUMNS + 1)
     for k in range(points.column.size):
         column = np.int64(points.column[k])
-        first, last = number - points.back[k], number + points.ahead[k]
+        first, last = number - points.lag[k], number + points.lag[k]
         if first <= newest - size or last > newest:
             continue
         before, after = first % size, last % size
@@ -274,8 +267,8 @@ def _shifts(points, history, number, newest):
             continue
         width = _median(history.widths_px[present], column, True, scratch)
         shift = _centroid_shift(width_before, width, width_after)
-        expected = _interpolated(row_before, row_after, points.back[k], points.ahead[k])
         points.shift_px[k] = shift
+        expected = _between(row_before, row_after)
         points.difference_px[k] = history.rows[present, column] - expected
 
 
