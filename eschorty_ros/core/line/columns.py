@@ -12,8 +12,8 @@ from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_S
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 
 _ROOM = 128
-# Room for padding. With it a column is an odd number of cache lines, so that the places to which
-# events are appended are in all sets of the cache.
+# Room for padding. With it a column's two places are an odd number of cache lines, so that those to
+# which events are appended are in all sets of the cache.
 PADDING = BLOCK + 8
 _ALL_ROWS = np.empty(0, np.uint32)
 
@@ -21,7 +21,8 @@ _ALL_ROWS = np.empty(0, np.uint32)
 class Columns(NamedTuple):
     """Packed events by column: ``counts[c]`` of them from ``starts[c]`` on.
 
-    Behind those of all columns are the late ones of a `PhaseGate` that keeps them.
+    A column's place is followed by that of the late events of a `PhaseGate` that keeps them, those
+    of ``starts[columns + c]``: appended to the others they find room there.
 
     - ``seeds``: Row of the line in the last period, fixed point; -1 for none.
     - ``rivals``: Row of a second line that is nearly as strong; -1 for none.
@@ -85,7 +86,7 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
     size = room + PADDING
     return Columns(
         packed=np.empty(2 * columns * size, np.uint32),
-        starts=np.arange(2 * columns) * size,
+        starts=np.arange(2 * columns).reshape(columns, 2).T.ravel() * size,
         counts=np.zeros(2 * columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
         rivals=np.full(columns, -1, np.int64),
@@ -157,7 +158,8 @@ def _append_event(bins, n, t_us, column, row, polarity):
     if not _is_selected(bins, c, r, late):
         return n + np.uint64(1)
     if events < bins.room:
-        at = place * np.uintp(bins.room + np.uint32(PADDING))
+        behind = np.uintp(2) * c + np.uintp(late > 0)
+        at = behind * np.uintp(bins.room + np.uint32(PADDING))
         bins.packed[at + np.uintp(events)] = np.uint32(
             (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
             | (np.uint32(polarity) << np.uint32(ROW_BITS))

@@ -17,6 +17,7 @@ from eschorty_ros.core.modulation.phase_gate import (
 )
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.report.accuracy import true_range_mm
 from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane
@@ -195,6 +196,37 @@ def test_slow_pixels_of_a_surface_that_becomes_dark_keep_their_points(tmp_path):
     without, learned = both(recorded(tmp_path, HalfDark(1320.0), pixels="noisy"))
     assert learned.counters["events_gated"] > 0
     assert len(learned.profiles) > 0.999 * len(without.profiles), f"seed {SEED}"
+
+
+def test_a_column_with_many_late_events_does_not_change_the_next_one(tmp_path):
+    recording = recorded(tmp_path, Plane(1320.0, slope_column=0.2), pixels="noisy")
+    modulation, column = recording.modulation, 100
+    period_us, first_us = modulation.period_us, modulation.on_edge_us
+    data = b"".join(RawReader(recording.events_path).chunks(1 << 20))
+    events = Decoder(320, CALIBRATION.rows).decode(data)
+    t, x, y, p = events.t, events.x, events.y, events.p
+    row = round(float(np.mean(y[x == column]))) + 6
+    rng = np.random.default_rng(SEED)
+    times = []
+    # A column has room for 128 events, and for more once it is full.
+    for k in range(12, 24):
+        edge_us = first_us + k * period_us
+        times += [edge_us + rng.integers(300, 900, 4 * k), edge_us + rng.integers(5500, 6900, 110)]
+    added_us = np.concatenate(times).astype(np.int64)
+    ones = np.ones(added_us.size, np.uint8)
+    more = added_us, column * ones.astype(np.uint16), row * ones.astype(np.uint16), ones
+    rows = []
+    for parts in ([(t, x, y, p)], [(t, x, y, p), more]):
+        chosen = Settings(phase_gate_us=GATE_LEARNED, smoothing_half_width=0)
+        found, reconstructor = reconstruct(
+            stream(parts), modulation, chosen, calibration=recording.calibration
+        )
+        assert reconstructor.counters["events_gated"] > 0
+        near = np.isin(found.column, (column - 1, column + 1))
+        rows.append(found.row[near])
+    moved_px = np.abs(rows[1] - rows[0]).max()
+    print(f"rows beside it moved by {moved_px:.3f} px at most")
+    assert moved_px < 0.02, f"seed {SEED}"
 
 
 def test_a_learned_gate_does_not_move_a_line_that_moves_while_it_is_lit(tmp_path):
