@@ -76,7 +76,7 @@ class JobQueue:
             return True, ""
         end_s = time.monotonic() + timeout_s
         while not answered.wait(min(_POLL_S, timeout_s)):
-            if not running():
+            if not running() and turn.acquire(blocking=False):
                 return False, "the node was shut down"
             if time.monotonic() > end_s and turn.acquire(blocking=False):
                 return False, f"the reconstruction did not answer within {timeout_s:g} s"

@@ -15,6 +15,8 @@ def test_a_job_that_its_caller_gave_up_never_begins():
     jobs, done = JobQueue(1), []
     given_up = jobs.run(lambda: done.append(1), 0.01, lambda: True)
     assert given_up == (False, "the reconstruction did not answer within 0.01 s")
+    ended = jobs.run(lambda: done.append(1), 10.0, lambda: False)
+    assert ended == (False, "the node was shut down")
     work(jobs)
     assert done == []
     assert jobs.run(lambda: done.append(2), 0.0, lambda: True) == (True, "")

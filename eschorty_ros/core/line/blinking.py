@@ -66,10 +66,10 @@ class Blink(NamedTuple):
     x and y, and the numbers of those that had lines before them and of those near these.
     """
 
+    lines: NDArray[np.float64]
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
     lit_us: np.uint32 = np.uint32(0)
-    lines: NDArray[np.float64] = np.zeros(4)
 
 
 class Vector(NamedTuple):
@@ -89,14 +89,15 @@ class _LaserTest(NamedTuple):
 
 def blink(modulation: Modulation, every: int) -> Blink:
     """Return the test for profiles of ``every`` periods; none where a period is too short."""
+    no_lines = np.zeros(4)
     if modulation.period_us < PERIOD_MIN_US:
-        return Blink()
+        return Blink(no_lines)
     turn = 1 << 32
     return Blink(
+        no_lines,
         np.uint32(round(turn / modulation.period_us)),
         np.uint32(round(turn * modulation.duty)),
         np.uint32(round(modulation.duty * modulation.period_us) if every == 1 else 0),
-        np.zeros(4),
     )
 
 

@@ -109,8 +109,8 @@ def estimate(
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()
-    footprint = make_footprint(estimator.half_max, columns=0)
-    _estimate_columns(columns, estimator.half_max, estimator, Blink(), footprint, found, row_counts)
+    footprint, blink = make_footprint(estimator.half_max, columns=0), Blink(lines=np.zeros(4))
+    _estimate_columns(columns, estimator.half_max, estimator, blink, footprint, found, row_counts)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (
         np.ascontiguousarray(values.T[:, by_column])

@@ -94,7 +94,7 @@ class Footprint(NamedTuple):
 UNDECIDED, LEARNED_ROWS, MEAN_ROWS = 0, 1, 2
 
 
-def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Footprint:
+def make_footprint(half_max: int, columns: int) -> Footprint:
     """Return a footprint to be learned, for windows of ``half_max`` and narrower."""
     reach = half_max // FRACTION + 2
     size = 2 * (_PLACES * reach + _SIDE) + 1
@@ -123,7 +123,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
         ),
         reach=reach,
     )
-    footprint.state["choice"] = choice
+    footprint.state["choice"] = MEAN_ROWS
     return footprint
 
 

@@ -27,6 +27,7 @@ from eschorty_ros.core.reconstruction.recording_warnings import (
     shown_frequency_hz,
 )
 from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction.windows import JOBS_MAX
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import SETTINGS_FILE, STAGE_FILE, TRUTH_FILE, between
@@ -94,7 +95,7 @@ def reconstruct_recording(
     refuse_other_sensor(name, *reader.header.named_size, build)
     recording, wrapped = in_wrap(recording)
     settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
-    jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    jobs = min(len(os.sched_getaffinity(0)), JOBS_MAX) if jobs is None else jobs
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
     done = 0
@@ -273,7 +274,7 @@ def _push(
 
 
 def stage_speed_mm_s(recording: Recording) -> float:
-    """Return the stage's median speed while it cruises; 0 when it rests.
+    """Return the stage's median speed while it cruises; 0 when it rests or has gaps alone.
 
     Positive where the first pass is towards +y.
     """
@@ -284,7 +285,10 @@ def stage_speed_mm_s(recording: Recording) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = np.diff(recording.stage.position_mm(t_us)) / np.diff(t_us) * 1e6
     # A sample that is wrong makes two intervals with a speed that the stage does not have.
-    near = np.pad(speed[np.isfinite(speed)], 2, mode="edge")
+    known = speed[np.isfinite(speed)]
+    if not known.size:
+        return 0.0
+    near = np.pad(known, 2, mode="edge")
     speed = np.median(np.lib.stride_tricks.sliding_window_view(near, 5), axis=1)
     cruising = speed[np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)]
     if not cruising.size:

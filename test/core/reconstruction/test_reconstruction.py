@@ -1,5 +1,6 @@
 """Bytes to profiles: rows against the truth, splits, phase, scenes and counters."""
 
+import os
 from dataclasses import fields, replace
 
 import numpy as np
@@ -21,9 +22,12 @@ from eschorty_ros.core.reconstruction import (
     place_link,
     profile_length,
     profile_rows,
+    reconstruct_recording,
     region_window,
     windows,
 )
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import simulate_recording
 
 SEED = 77
 MODEL = CALIBRATION.model()
@@ -588,3 +592,12 @@ def test_settings_describe_themselves_and_refuse_bad_values():
         assert item.name in str(caught.value)
     with pytest.raises(ArgumentError):
         Reconstructor(CALIBRATION, Modulation(16.0), Settings(periods_per_profile=1000))
+
+
+def test_a_computer_with_more_cores_than_threads_may_be_reconstructs(tmp_path, monkeypatch):
+    narrow = replace(CALIBRATION, columns=16, principal_column=7.5)
+    scene, modulation = Plane(1320.0), Modulation(70.0)
+    recording = simulate_recording(tmp_path, scene, narrow, modulation, 10.0, 12.0, 20.0, SEED)
+    one = reconstruct_recording(recording, jobs=1)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(1000))
+    assert reconstruct_recording(recording).points.tobytes() == one.points.tobytes()

@@ -229,3 +229,10 @@ def test_the_speed_of_a_stage_that_goes_forth_and_back_is_that_of_one_pass():
     stage.append(t_us, np.interp(t_us, [0, 1_000_000, 1_100_000, 2_100_000], [10, 60, 60, 10]))
     recording = SimpleNamespace(stage=stage, calibration=load_calibration("config_3"))
     assert stage_speed_mm_s(recording) == pytest.approx(50.0, rel=0.01)
+
+
+def test_a_stage_with_gaps_alone_has_no_speed():
+    stage = StageTrack(max_gap_us=1_000_000)
+    stage.append(np.array([0, 10_000_000]), np.array([10.0, 60.0]))
+    recording = SimpleNamespace(stage=stage, calibration=load_calibration("config_3"))
+    assert stage_speed_mm_s(recording) == 0.0
