@@ -67,13 +67,13 @@ class PacedWaiting:
         return time.monotonic() - self._tick_s < limit_s
 
     def watch(self, enabled: bool) -> None:
-        """See ``Instrument``."""
+        """Switch the check of light and events, which raises ``ScanFailure`` at a tick."""
         if enabled:
             self.monitor.restart_progress()
         self._watching = enabled
 
     def shield(self) -> None:
-        """See ``Instrument``."""
+        """Raise no ``ScanCanceled`` from here on."""
         self._shielded = True
 
     @contextlib.contextmanager
@@ -86,7 +86,7 @@ class PacedWaiting:
             self._shielded = before
 
     def drain(self, no_progress_s: float, within_s: float) -> None:
-        """See ``Instrument``."""
+        """Wait until the reconstruction has passed the present time."""
         target_ns, begun_ns = self._now_ns(), self.monitor.until_ns
         begun_s = time.monotonic()
         while self.monitor.until_ns < target_ns:
@@ -111,7 +111,7 @@ class PacedWaiting:
             self.tick()
 
     def report(self, phase: str) -> None:
-        """See ``Instrument``."""
+        """Name the phase in the feedback."""
         self._phase = phase
         # After a signal feedback can no longer be sent.
         with contextlib.suppress(ScanFailure):

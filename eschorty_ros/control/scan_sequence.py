@@ -218,7 +218,7 @@ def check_request(request: ScanRequest, limits: ScanLimits, unit: str = "m") -> 
     length_mm = abs(request.stop_mm - request.start_mm)
     if request.frequency_hz and length_mm < request.speed_mm_s / request.frequency_hz:
         raise ArgumentError(
-            f"start to stop is {length_mm * scale:.4g} {unit}, less than the way of one period, "
+            f"start to stop is {length_mm * scale:.4g} {unit}, less than the travel of one period, "
             f"{request.speed_mm_s / request.frequency_hz * scale:.4g} {unit} at "
             f"{request.speed_mm_s * scale:g} {unit}/s and {request.frequency_hz:g} Hz; choose a "
             "longer sweep or a lower speed"
@@ -264,11 +264,11 @@ def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | 
 
 
 class SweepProgress:
-    """The share of a scan's way between start and stop, of all passes, that is reconstructed."""
+    """The share of a scan's travel between start and stop, of all passes, that is reconstructed."""
 
     def __init__(self, request: ScanRequest) -> None:
         self._ends_mm = sorted((request.start_mm, request.stop_mm))
-        self._way_mm = request.passes * (self._ends_mm[1] - self._ends_mm[0])
+        self._travel_mm = request.passes * (self._ends_mm[1] - self._ends_mm[0])
         self._gone_mm = 0.0
         self._last_mm: float | None = None
         self._totals: tuple[float, int, int] | None = None
@@ -303,7 +303,7 @@ class SweepProgress:
         if self._last_mm is not None:
             self._gone_mm += abs(position_mm - self._last_mm)
         self._last_mm = position_mm
-        return min(self._gone_mm / self._way_mm, 1.0)
+        return min(self._gone_mm / self._travel_mm, 1.0)
 
 
 def end_light(instrument: Instrument, outcome: Outcome) -> None:

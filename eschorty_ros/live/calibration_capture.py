@@ -94,7 +94,7 @@ class _Frame:
         self.packets_lost = 0
 
     def packet(self, packet: Packet) -> None:
-        """See ``Capture``."""
+        """Add the events of a packet to the frame."""
         missing = 0 if self._next_seq is None else packet.seq - self._next_seq
         if missing:
             self.packets_lost += max(missing, 0)
@@ -115,10 +115,10 @@ class PostsCapture(_Frame):
         self._line_width_px = line_width_px
 
     def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
-        """See ``Capture``; the frame is enough for posts at rest."""
+        """Add nothing: the frame is enough for posts at rest."""
 
     def find(self, frame: AggregateFrame) -> Findings:
-        """See ``Capture``."""
+        """Find posts in the frame and match them with the known targets."""
         posts = find_posts(frame, self._line_width_px)
         match = match_posts(posts, self._known, self._nominal.model())
         return Findings(
@@ -140,11 +140,11 @@ class SweepCapture(_Frame):
         self._parts: list[tuple[Profiles, NDArray[np.float64]]] = []
 
     def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
-        """See ``Capture``."""
+        """Keep profiles and their stage positions."""
         self._parts.append((timed.profiles, stage_mm))
 
     def find(self, frame: AggregateFrame) -> Findings:
-        """See ``Capture``."""
+        """Measure the target in the profiles."""
         parts = list(self._parts)
         if not parts:
             return Findings(rejected=(f"target {self._target.label}: no profile shows it",))

@@ -298,10 +298,10 @@ def pass_index(
     of_period = np.zeros(len(forth), dtype=np.int64)
     begin = 0
     for number in range(1, sweep.passes):
-        # The turn is where most periods before and after it go their way.
+        # The turn is where most periods before and after it have their direction.
         two = 2 * (len(forth) - begin) // (sweep.passes - number + 1)
-        way = np.cumsum(forth[begin : begin + two]) * (1 if number % 2 else -1)
-        begin += int(np.argmax(way)) + 1 if two else 0
+        balance = np.cumsum(forth[begin : begin + two]) * (1 if number % 2 else -1)
+        begin += int(np.argmax(balance)) + 1 if two else 0
         of_period[begin:] = number
     return of_period[period]
 

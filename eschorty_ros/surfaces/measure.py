@@ -194,7 +194,7 @@ def _distance(first: Part, other: Part, common_mm: float) -> Value:
     step, slopes = values[1], values[2:]
     cosine = 1.0 / math.sqrt(1.0 + slopes @ slopes)
     gradient = np.array([0.0, cosine, *(-step * slopes * cosine**3)])
-    # The shared error of the slopes acts over the way from one surface to the other.
+    # The shared error of the slopes acts over the distance from one surface to the other.
     apart = np.median(other.xyz[:, 1:], axis=0) - np.median(first.xyz[:, 1:], axis=0)
     lever = apart / np.ptp(both.xyz[:, 1:], axis=0)
     variance = float(gradient @ covariance @ gradient)

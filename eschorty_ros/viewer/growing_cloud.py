@@ -46,7 +46,7 @@ class GrowingCloud:
         with self._lock:
             self._count = self._received = 0
             self._stride = 1
-            self._pass, self._way = 1, 0.0
+            self._pass, self._direction = 1, 0.0
             self.changes += 1
 
     def add(self, points: NDArray[np.void]) -> None:
@@ -83,7 +83,7 @@ class GrowingCloud:
         self._count += len(part)
 
     def _passes(self, points: NDArray[np.void], names: tuple[str, ...]) -> NDArray[np.float32]:
-        """Return each point's pass: the stage goes the other way in the next one."""
+        """Return each point's pass: the stage turns before the next one."""
         if not {"t", "column"} <= set(names) or not len(points):
             return np.full(len(points), np.nan, np.float32)
         begins = profile_begins(points["column"])
@@ -97,9 +97,9 @@ class GrowingCloud:
         both = np.bincount(profile, t * y)
         spread = np.bincount(profile, t * t) * np.bincount(profile, y * y)
         number = np.empty(len(begins), np.float32)
-        for k, way in enumerate(np.where(both**2 > _MOVING * spread, np.sign(both), 0.0)):
-            self._pass += int(way * self._way < 0.0)
-            self._way = way or self._way
+        for k, direction in enumerate(np.where(both**2 > _MOVING * spread, np.sign(both), 0.0)):
+            self._pass += int(direction * self._direction < 0.0)
+            self._direction = direction or self._direction
             number[k] = self._pass
         return number[profile]
 

@@ -19,7 +19,7 @@ GROSS_PX = 10.0
 """Half the line's full width at half maximum: a row this far off is not on the line."""
 
 RIM_MM = 3.0
-"""Half the line's thickness along the stage at 1.3 m, and the stage's way within a lit phase."""
+"""Half the line's thickness along the stage at 1.3 m, and the stage's travel within a lit phase."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

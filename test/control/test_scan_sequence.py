@@ -145,7 +145,7 @@ def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():
         ({"frequency_hz": 15.9}, "frequency is 15.9 Hz"),
         ({"duty": 1.0}, "duty is 1"),
         ({"passes": 256}, "passes is 256"),
-        ({"stop_mm": 20.5, "frequency_hz": 70.0}, "start to stop is 0.0005 m, less than the way"),
+        ({"stop_mm": 20.5, "frequency_hz": 70.0}, "start to stop is 0.0005 m, less than the"),
     ],
 )
 def test_bad_requests_are_named(change, words):

@@ -89,12 +89,12 @@ class CalibrationReport:
 
     @property
     def identifiable(self) -> bool:
-        """Whether the targets determine the build."""
+        """Return whether the targets determine the build."""
         return IDENTIFIABLE in self.verdicts
 
     @property
     def reservations(self) -> list[str]:
-        """The other verdicts."""
+        """Return the other verdicts."""
         return [line for line in self.verdicts if line != IDENTIFIABLE]
 
     @property

@@ -258,8 +258,8 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
     likelihood = footprint.likelihood
     peak = likelihood[_SIDE + best]
     total, first, second = 0.0, 0.0, 0.0
-    for way in (1, -1):
-        m = best if way > 0 else best - 1
+    for direction in (1, -1):
+        m = best if direction > 0 else best - 1
         while -_SIDE <= m < _SIDE:
             below = np.int64(peak - likelihood[_SIDE + m])
             if below >= _SHARES.size:
@@ -268,7 +268,7 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
             total += share
             first += m * share
             second += m * m * share
-            m += way
+            m += direction
     offset = first / total
     mean = (place + offset) / _PLACES
     variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)

@@ -4,10 +4,10 @@ A line whose rows are where they were has the same error in all profiles. One th
 a part of a row, as pixels remember where it was, in all columns alike: they give ON events ahead of
 its centre and OFF events behind it. Where both are as far, the line is in the middle of their two
 rows. The mean of all events is nearer to the kind with more of them, and its distance from the
-middle is its uncertainty, up to the way of the line from profile to profile.
+middle is its uncertainty, up to the displacement of the line from profile to profile.
 
 Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
-Minus their mean product is the variance of the jumps; a way has none.
+Minus their mean product is the variance of the jumps; a steady displacement has none.
 
 A line that gets narrower or wider for a few profiles passes an edge, and is off by half of the rows
 that are missing, or new, at most. Means over blocks show changes that are too small to be seen in a

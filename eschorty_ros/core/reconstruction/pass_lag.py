@@ -2,7 +2,7 @@
 
 Pixels remember where a line was, so that a row shows the surface of a moment ago. A pass forth and
 one back are late in opposite directions along the stage: where they overlap, ranges differ by the
-slope of the surface times the way of the lag, twice. An offset between the clocks of camera and
+slope of the surface times the travel in the lag, twice. An offset between the clocks of camera and
 stage does the same. In a single pass a lag moves the cloud as a whole, which nothing shows.
 """
 
@@ -19,8 +19,8 @@ from eschorty_ros.core.reconstruction.profiles import add_stage, stage_offset_m
 # Columns of a cell; bands of columns, the scatter of whose lags gives the deviation of their mean.
 _COLUMNS = 8
 _BANDS = 16
-# Steeper cells are on a step, and those whose slope does not go on for this way to either side: the
-# thickness of the line makes a slope of a step.
+# Steeper cells are on a step, and those whose slope does not go on for this distance to either
+# side: the thickness of the line makes a slope of a step.
 _SLOPE_MAX = 1.0
 _SMOOTH_MM = 8.0
 # Least cells of a band, and bands with so many.
@@ -109,8 +109,8 @@ def _speed_mm_us(
 ) -> NDArray[np.float64]:
     """Return the stage's speed at each point; 0 where the track does not cover it."""
     t_us = _times_us(points, origin_us)
-    way_mm = track.position_mm(t_us + _SPEED_US) - track.position_mm(t_us - _SPEED_US)
-    return np.nan_to_num(way_mm) / (2 * _SPEED_US)
+    moved_mm = track.position_mm(t_us + _SPEED_US) - track.position_mm(t_us - _SPEED_US)
+    return np.nan_to_num(moved_mm) / (2 * _SPEED_US)
 
 
 def _cruises(speed_mm_us: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -168,8 +168,8 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
     (forth_mm, back_mm), faster = stage_mm[:, 1:-1], np.diff(speed[:, 1:-1], axis=0)[0]
     apart_mm = range_mm[0, 1:-1] - range_mm[1, 1:-1] - slope * (forth_mm - back_mm)
     known = np.isfinite(apart_mm) & (np.abs(slopes) < _SLOPE_MAX).all(axis=0)
-    for way in (-half, half):
-        known &= np.abs(slope - np.roll(beside, way, axis=0)[1:-1]) < 0.5 * np.abs(slope)
+    for shift in (-half, half):
+        known &= np.abs(slope - np.roll(beside, shift, axis=0)[1:-1]) < 0.5 * np.abs(slope)
     left_us = 0.0
     for _ in range(_ROUNDS):
         if not known.any():

@@ -21,12 +21,12 @@ _TURNS_ENOUGH = 20
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
 _FEW = 10
-# Longest way of a stage and largest position in metres, and what the readings of one at rest differ
-# by.
+# Longest travel of a stage and largest position in metres, and what the readings of one at rest
+# differ by.
 _METRES_MAX, _METRES_FAR = 0.3, 1.0
 _REST_MM = 0.003
-# Part of the stage's way and time that may be after the last event: camera and stage do not end at
-# once.
+# Part of the stage's travel and time that may be after the last event: camera and stage do not end
+# at once.
 _LEFT_SHARE = 0.02
 _LEFT_US = 100_000
 # Speed of a jump, mm/s and over that of the sweep.
@@ -127,12 +127,12 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
     """
     t_us, position_mm = (recording.stage_samples[name] for name in ("t_us", "position_mm"))
     found, name = [], recording.events_path.name
-    way_mm = float(np.ptp(position_mm))
-    if _REST_MM < way_mm <= _METRES_MAX and np.abs(position_mm).max() < _METRES_FAR:
+    travel_mm = float(np.ptp(position_mm))
+    if _REST_MM < travel_mm <= _METRES_MAX and np.abs(position_mm).max() < _METRES_FAR:
         found.append(
-            f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
+            f"the stage moves by {travel_mm:.3g} mm in stage.csv; where these are metres, write mm"
         )
-    if way_mm <= _REST_MM and t_us.size > 1:
+    if travel_mm <= _REST_MM and t_us.size > 1:
         found.append(
             f"the stage stays at {position_mm[0]:.6g} mm in stage.csv: all profiles are in one "
             "place; where it moved, give its positions"
@@ -143,7 +143,7 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"the stage jumps from {position_mm[jump]:.6g} to {position_mm[jump + 1]:.6g} mm at "
             f"{t_us[jump + 1] * 1e-6:.3f} s in stage.csv; remove the sample that is wrong"
         )
-    least_mm = max(_LEFT_SHARE * way_mm, _REST_MM)
+    least_mm = max(_LEFT_SHARE * travel_mm, _REST_MM)
     begin_us, end_us = span_us
     if t_us[0] > end_us or t_us[-1] < begin_us:
         # Another line says that they do not overlap.

@@ -43,7 +43,7 @@ def _choice(default: str, choices: tuple[str, ...], description: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of the way from events to points.
+    """Settings of a reconstruction, from events to points.
 
     Every field carries ``metadata``: ``description``, ``unit`` and ``range`` (both ends included)
     or ``choices``.

@@ -126,7 +126,7 @@ class InstrumentClient(PacedWaiting):
         super().prepare(canceled, guarded)
 
     def check_nodes(self) -> None:
-        """See ``Instrument``."""
+        """Raise ``ScanFailure`` that names the component that does not answer."""
         begun_ns = self.monitor.until_ns
         end_s = time.monotonic() + self._node_timeout_s
         for holds, failure in self._needed(begun_ns):
@@ -168,7 +168,7 @@ class InstrumentClient(PacedWaiting):
         ]
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """See ``Instrument``."""
+        """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""
         requested = {
             name: float(value)
             for name, value in (("frequency", frequency_hz), ("duty", duty))
@@ -194,7 +194,7 @@ class InstrumentClient(PacedWaiting):
                   f"laser: its state does not show {requested}")  # fmt: skip
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
-        """See ``Instrument``."""
+        """Move the stage and wait for the end of the motion."""
         goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
         # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
         self._sent = self._stage.send_goal_async(goal)
@@ -216,7 +216,7 @@ class InstrumentClient(PacedWaiting):
             raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
 
     def stop_stage(self) -> None:
-        """See ``Instrument``."""
+        """End a move under way and wait until the stage rests."""
         sent, self._sent = self._sent, None
         if sent is None:
             return
@@ -229,7 +229,7 @@ class InstrumentClient(PacedWaiting):
             self._answer(future, "stage/move")
 
     def laser_on(self) -> None:
-        """See ``Instrument``."""
+        """Start the heartbeat, arm, enable; return when the output reads back on."""
         self.tick()
         self._heartbeat_on = True
         self._heartbeat.begin()
@@ -256,7 +256,7 @@ class InstrumentClient(PacedWaiting):
         return ""
 
     def laser_off(self) -> None:
-        """See ``Instrument``."""
+        """Disable; return when the output reads back off. The heartbeat ends in any case."""
         try:
             if self._heartbeat_on:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
@@ -323,7 +323,7 @@ class ScanClient(InstrumentClient):
     }
 
     def begin_scan(self, request: ScanRequest) -> None:
-        """See ``ScanInstrument``; a scan that is still open is ended and published first."""
+        """Start to collect points; a scan that is still open is ended and published first."""
         state = self.monitor.reconstruction
         if state is not None and state.scan_id:
             self._node.get_logger().warning(f"ending {state.scan_id}, which was left open")
@@ -342,7 +342,7 @@ class ScanClient(InstrumentClient):
             raise ScanFailure(f"reconstruction: {answer.message}")
 
     def end_scan(self, scan_id: str) -> ScanSummary:
-        """See ``ScanInstrument``."""
+        """Publish the points collected."""
         request = EndScan.Request(scan_id=scan_id)
         answer = self._call("reconstruction/end_scan", request, _ASSEMBLE_S, repeat=False)
         if not answer.success:

@@ -19,7 +19,7 @@ from eschorty_ros.simulation.pixels._passage import GAP_MIN, GAP_STEPS
 from eschorty_ros.simulation.pixels._response import OFF, ON, UNKNOWN
 
 _WAY_STEPS, _WAY_MAX = 64, 0.9
-"""Entries and end of the table of times: square root of the part of the way gone."""
+"""Entries and end of the table of times: square root of the part of the change done."""
 _LAG_STEPS, _LAG_MAX = 32, 0.75
 """The same for the square root of ``rho``."""
 _DRAW_STEPS, _PACE_STEPS = 512, 32
@@ -30,7 +30,7 @@ _EARLY, _LATE = 2.5, 0.5
 
 @cache
 def way_times() -> NDArray[np.float32]:
-    """Return the time after which a signal that started from rest has gone a part of its way.
+    """Return the time after which a signal that started from rest has done a part of its change.
 
     In time constants of the photoreceptor, shape (_LAG_STEPS + 2, _WAY_STEPS + 2). Rows:
     ``sqrt(tau_f / tau_p)`` from 0 to ``_LAG_MAX``; columns: square root of the part, 0 to
@@ -91,10 +91,10 @@ def _inside(index, end):
 
 
 @kernel
-def _gone(u, per_way, level, x):
-    """Return the square root of the part of the way to where y is ``exp(x)`` times ``level``."""
+def _gone(u, per_change, level, x):
+    """Return the square root of the part of the change to where y is ``exp(x)`` times ``level``."""
     value = level * (1.0 + x * (1.0 + x * (0.5 + x * (1 / 6 + x * (1 / 24)))))
-    return math.sqrt((u - value) * per_way)
+    return math.sqrt((u - value) * per_change)
 
 
 @kernel
@@ -108,11 +108,11 @@ def _prompt(signal, levels, noise, ways, gaps, draw):
     falls = settled < u
     level = levels.on if falls else levels.off
     per_gap = noise if falls else -noise
-    per_way = 1.0 / (u - settled)
+    per_change = 1.0 / (u - settled)
     lag = math.sqrt(follower_us / tau_us) * (_LAG_STEPS / _LAG_MAX)
     scale = _WAY_STEPS / _WAY_MAX
-    late = _gone(u, per_way, level, _LATE * per_gap) * scale
-    early = _gone(u, per_way, level, _EARLY * per_gap) * scale
+    late = _gone(u, per_change, level, _LATE * per_gap) * scale
+    early = _gone(u, per_change, level, _EARLY * per_gap) * scale
     known = early >= 0.0 and late < _WAY_STEPS and lag < _LAG_STEPS
     lag, late, early = (
         _inside(lag, _LAG_STEPS),
@@ -124,7 +124,7 @@ def _prompt(signal, levels, noise, ways, gaps, draw):
     pace = abs(way_us) / (_EARLY - _LATE)
     share = _inside(pace / (pace + follower_us), 1.0)
     gap = _between(gaps, share * _PACE_STEPS, draw * _DRAW_STEPS)
-    gone = _gone(u, per_way, level, gap * per_gap) * scale
+    gone = _gone(u, per_change, level, gap * per_gap) * scale
     after_us = _between(ways, lag, _inside(gone, _WAY_STEPS)) * tau_us
     if not (known and gone < _WAY_STEPS):
         return np.inf, UNKNOWN

@@ -58,7 +58,7 @@ def _advanced(signal, t_us):
     if t_us > _SETTLED * tau_us and t_us > _SETTLED * follower_us:
         return settled, settled
     x, z = t_us / tau_us, t_us / follower_us
-    way = u - settled
+    change = u - settled
     fade = math.exp(-x) if x < _SETTLED else 0.0
     lag = math.exp(-z) if z < _SETTLED else 0.0
     apart = 1.0 - follower_us / tau_us
@@ -69,8 +69,8 @@ def _advanced(signal, t_us):
         # expm1(w) / w: the two exponentials are nearly or exactly one.
         share = lag * (t_us / follower_us) * (math.expm1(w) / w if w != 0.0 else 1.0)
     if x < 0.01 and z < 0.01:
-        return u + way * math.expm1(-x), y + (y - settled) * math.expm1(-z) + way * share
-    return settled + way * fade, settled + (y - settled) * lag + way * share
+        return u + change * math.expm1(-x), y + (y - settled) * math.expm1(-z) + change * share
+    return settled + change * fade, settled + (y - settled) * lag + change * share
 
 
 @kernel
@@ -155,9 +155,9 @@ def _earliest_us(signal, t_us, levels, reach):
         return t_us
     # Where y is ahead of u its lead only decays, so that the signal may start from y.
     if settled < on_near:
-        way = min(u, y) - on_near
+        margin = min(u, y) - on_near
     elif settled > off_near:
-        way = max(u, y) - off_near
+        margin = max(u, y) - off_near
     else:
         return np.inf
     # Far ahead it is about to turn round; the risk of that is summed up from the start.
@@ -165,5 +165,5 @@ def _earliest_us(signal, t_us, levels, reach):
     if (y - u) * (u - settled) < -ahead_max * abs(u - settled):
         return t_us
     # The response to a ramp as steep as u is now: u itself moves less and y lags behind it.
-    ramp_us = tau_us * way / (u - settled)
+    ramp_us = tau_us * margin / (u - settled)
     return t_us + max(ramp_us, math.sqrt(2.0 * follower_us * ramp_us))

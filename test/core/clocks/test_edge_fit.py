@@ -35,11 +35,11 @@ def test_missing_and_spurious_edges_and_noisy_odometry(seed):
 
 
 @pytest.mark.parametrize(
-    ("way_mm", "late_ms"),
+    ("travel_mm", "late_ms"),
     [((10.0, 210.0), 40.0), ((10.0, 210.0), 800.0), ((10.0, 210.0), 4000.0), ((210.0, 10.0), 3.0)],
 )
-def test_the_ramps_correct_a_host_that_was_slow_from_the_start(way_mm, late_ms):
-    bench = StagePulses(way_mm)
+def test_the_ramps_correct_a_host_that_was_slow_from_the_start(travel_mm, late_ms):
+    bench = StagePulses(travel_mm)
     fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(late_ms))
     assert bench.error_um(fit) < 10.0
 
