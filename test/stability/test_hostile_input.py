@@ -166,7 +166,6 @@ CALLS: dict[str, Call] = {
     ),
     "evt3.Decoder": call(evt3.Decoder, width=SIDE, height=SIDE),
     "evt3.Decoder.decode": call(method(evt3.Decoder, "decode"), data=BYTES),
-    "evt3.WordCounter.add": call(method(evt3.WordCounter, "add"), data=BYTES),
     "evt3.begin_time": call(evt3.begin_time, data=BYTES),
     "evt3.first_time_high_us": call(evt3.first_time_high_us, data=BYTES),
     "evt3.time_span_us": call(evt3.time_span_us, data=BYTES),

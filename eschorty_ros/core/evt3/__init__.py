@@ -15,7 +15,6 @@ from eschorty_ros.core.evt3.time_span import (
     first_time_high_us,
     time_span_us,
 )
-from eschorty_ros.core.evt3.word_count import WordCounter
 
 __all__ = [
     "EVENT_DTYPE",
@@ -28,7 +27,6 @@ __all__ = [
     "EventArrays",
     "Events",
     "Triggers",
-    "WordCounter",
     "begin_time",
     "first_time_high_us",
     "sort_readout",

@@ -12,7 +12,6 @@ from std_srvs.srv import Trigger
 
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.base.numbers import number
-from eschorty_ros.core.evt3 import WordCounter
 from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import EventSource, LaserOutput
 from eschorty_ros.hardware.camera import BIASES, save_bias_file
@@ -163,11 +162,6 @@ class CameraNode(DeviceNode):
         running = thread is not None and thread.is_alive() and not self._ending.is_set()
         return running and source is not None and source.healthy
 
-    @property
-    def words(self) -> WordCounter:
-        """Return counts of the words in the stream, published or not."""
-        return self._packets.words
-
     def _stream(self, source: EventSource, ending: threading.Event) -> None:
         try:
             while not ending.is_set():
@@ -247,7 +241,7 @@ class CameraNode(DeviceNode):
         self._packets.dark = off and not message.armed
 
     def _report(self) -> diagnostics.Report:
-        source, packets, words = self._source, self._packets, self.words
+        source, packets = self._source, self._packets
         values: dict[str, Any] = {
             "device": source.identity.model if source is not None else "",
             "serial": source.identity.serial if source is not None else "",
@@ -256,9 +250,9 @@ class CameraNode(DeviceNode):
             "seq": packets.seq,
             "packets_per_s": self._rates["packets"].read(packets.packets),
             "bytes_per_s": self._rates["bytes"].read(packets.published_bytes),
-            "on_events_per_s": self._rates["on"].read(words.on),
-            "off_events_per_s": self._rates["off"].read(words.off),
-            "trigger_edges": words.triggers,
+            "on_events_per_s": self._rates["on"].read(packets.on),
+            "off_events_per_s": self._rates["off"].read(packets.off),
+            "trigger_edges": packets.trigger_edges,
             **packets.losses,
             "bytes_without_subscriber": packets.unsubscribed_bytes,
             "late_s": packets.late_s,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from event_camera_msgs.msg import EventPacket
 
-from eschorty_ros.core.evt3 import WordCounter
+from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.hardware.base.protocols import EventChunk
 from eschorty_ros.live.packet_cutting import Packetizer
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
@@ -25,7 +26,7 @@ class PacketPublisher:
       bytes without a subscriber.
     - ``late_s``: Time by which the newest chunk waited for publication, or an emulated camera is
       late.
-    - ``words``: Counts of the words in all of them.
+    - ``on``, ``off``: Events by polarity, published or not.
     """
 
     def __init__(self, publisher: Any, width: int, height: int, frame_id: str) -> None:
@@ -34,7 +35,9 @@ class PacketPublisher:
         self.published_bytes = 0
         self.unsubscribed_bytes = 0
         self.late_s = 0.0
-        self.words = WordCounter()
+        self.on = 0
+        self.off = 0
+        self._decoder = Decoder(width, height)
         self._publisher = publisher
         self._width = width
         self._height = height
@@ -45,12 +48,17 @@ class PacketPublisher:
     @property
     def losses(self) -> dict[str, int]:
         """Return the events that the sensor reports as dropped, by name."""
-        words = self.words
+        counts = self._decoder.counters
         return {
-            "sensor_drop_words": words.drop_words,
-            "erc_events_in": words.erc_events_in,
-            "erc_events_dropped": max(words.erc_events_in - words.erc_events_out, 0),
+            "sensor_drop_words": counts.sensor_drop_words,
+            "erc_events_in": counts.erc_events_in,
+            "erc_events_dropped": max(counts.erc_events_in - counts.erc_events_out, 0),
         }
+
+    @property
+    def trigger_edges(self) -> int:
+        """Return the number of edges at the camera's trigger input."""
+        return self._decoder.counters.triggers
 
     @property
     def dark(self) -> bool:
@@ -73,7 +81,11 @@ class PacketPublisher:
         if chunk.gap or chunk.restarted:
             self.flush()
             self.seq = 0 if chunk.restarted else self.seq + 1
-        self.words.add(chunk.data)
+            self._decoder.note_gap()
+        polarity = self._decoder.decode(chunk.data).p
+        on = int(np.count_nonzero(polarity))
+        self.on += on
+        self.off += polarity.size - on
         self.late_s = (now_ns - chunk.arrival_ns) * 1e-9
         self._publish(self._packetizer.push(chunk.data, chunk.arrival_ns))
 

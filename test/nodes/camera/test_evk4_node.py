@@ -20,6 +20,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.emulation.evk4 import Evk4Model
 from eschorty_ros.hardware.camera import evk4
 from eschorty_ros.live.device_messages import ns_from_stamp
@@ -256,9 +257,13 @@ def test_the_region_of_interest_changes_while_the_camera_streams(start: Start) -
 def test_events_dropped_by_the_rate_control_are_reported(start: Start, tmp_path: Path) -> None:
     still = StillBench(tmp_path)
     run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()
-    words = run.node.words
+
+    def arrived() -> int:
+        decoder = Decoder()
+        return sum(len(decoder.decode(bytes(packet.events))) for packet in list(run.packets))
+
     still.light(500.0)
-    still.run(100, lambda: words.on + words.off)
+    still.run(100, arrived)
     dropped = still.statistic("rate_dropped")
     assert dropped > still.statistic("events")
     status = run.status(lambda s: "erc_events_dropped" in s.message, "the loss in the diagnostics")
