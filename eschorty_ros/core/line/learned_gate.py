@@ -1,10 +1,11 @@
-"""The phase gate with which the rows of a stream scatter least, where it halves their variance.
+"""The phase gate with which the rows of a stream scatter and lag least, where that pays.
 
 Pixels answer an edge of the laser with a burst of events. Later ones, which they give by themselves
 or long after the edge, say less about where the line is. How long the burst is depends on the
 camera, so gates of several lengths are compared on a profile: by the scatter of the rows of near
-columns, and by whether the rows of near columns move together. They do where the line moves while
-it is lit, since what it passes on its way counts, too; then no gate is used.
+columns, which smoothing reduces, and by the lag behind a line that moves from profile to profile,
+which it does not. No gate is used that moves the rows of near columns together: the line moves
+while it is lit, and what it passes counts, too.
 
 Events outside the gate are kept apart, and used in columns that have many of them: a surface that
 is darker or moves more than those of that profile.
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.scatter import _median_difference
+from eschorty_ros.core.line.scatter import APART, _median_difference
 from eschorty_ros.core.line.window import FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import (
@@ -35,13 +36,17 @@ _TOGETHER = 16
 # Mean square of the sum of their differences over the sum of the squares: 1 by chance, as much as
 # columns are alike on a textured surface, and the number of all where the line moves.
 _TOGETHER_MAX = 6.0
-# Share of the variance of rows that a gate leaves at most: it takes time, and the events it leaves
-# lag more behind a line that moves.
-_VARIANCE_MAX = 0.5
+# Share of the mean square error that a gate leaves at most: it takes time.
+_ERROR2_MAX = 0.5
+# Median size of the second differences of rows over their standard deviation.
+_MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(6.0)
 # Standard deviations by which a column's number of late events exceeds the usual one.
 _DEVIATIONS = 3.0
 # Events for a row.
 _EVENTS_MIN = 4
+# Displacement from profile to profile, in fixed point, at which a gate lags by a few hundredths of
+# a row at most.
+_STILL = 3
 # Share of the rows that a gate has to keep.
 _FOUND_MIN = 0.995
 
@@ -51,8 +56,9 @@ class LearnedGate(NamedTuple):
 
     All have the fields of a `PhaseGate`. The state is ``known`` once a choice is made, the first of
     which is no gate, and has ``changed`` if that is another than before; its ``late`` is the usual
-    number of late events of a column, and ``half`` the half width of the windows of rows in which
-    it is chosen, 0 before. Windows begin with the one that is ``kept``.
+    number of late events of a column, ``half`` the half width of the windows of rows in which it is
+    chosen, 0 before, and ``moving`` the displacement of the line then. Windows begin with the one
+    that is ``kept``.
     """
 
     state: Any
@@ -81,7 +87,7 @@ def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
 
 
 def _state(gate: PhaseGate) -> Any:
-    state = record(*PhaseGate._fields, "known", "changed", "late", "half")
+    state = record(*PhaseGate._fields, "known", "changed", "late", "half", "moving")
     for name, value in gate._asdict().items():
         state[name] = value
     return state
@@ -149,6 +155,47 @@ def _move_together(row, others):
     return ratios > _TOGETHER_MAX * blocks
 
 
+@kernel(_nrt=False)
+def _lag2(row, gated, seeds):
+    """Return the mean square by which a gate moves rows along with their line, px squared.
+
+    The line has moved from the ``seeds`` of the last profile. That of columns beside shows how far,
+    as both differences of one column have its noise.
+    """
+    products, squares, known = 0.0, 0.0, 0
+    for c in range(APART, row.size):
+        beside = c - APART
+        moved = row[beside] - seeds[beside] / FRACTION
+        product = (row[c] - gated[c]) * moved
+        if not np.isnan(product):
+            products += product
+            squares += moved * moved
+            known += 1
+    return products * products / (squares * known) if squares > 0.0 else 0.0
+
+
+@kernel(_nrt=False)
+def _columns_averaged(smoothing):
+    """Return how many columns a smoothed row of the last profile is the mean of, on average."""
+    total, points = 0.0, 0
+    for c in range(smoothing.row.shape[1]):
+        if not np.isnan(smoothing.row[0, c]):
+            total += smoothing.used[0, c]
+            points += 1
+    return total / points if points > 0 else 1.0
+
+
+@kernel(_nrt=False)
+def _displacement_px(history):
+    """Return how far lines move from profile to profile, the mean of the blocks with points."""
+    total, blocks = 0.0, 0
+    for block in range(1, history.step_px.size - 1):
+        if history.now.points[block] > 0.0:
+            total += history.step_px[block]
+            blocks += 1
+    return total / max(blocks, 1)
+
+
 @kernel
 def _usual_late(columns, gate):
     """Return the median number of a column's events outside the gate."""
@@ -163,15 +210,19 @@ def _usual_late(columns, gate):
 
 
 @kernel(_nrt=True)
-def _learn_gate(columns, half, gate):
+def _learn_gate(columns, half, smoothing, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
-    Returns true in the profile behind the one that changes the gate.
+    A gate is chosen again when the line moves twice as fast. Returns true in the profile behind the
+    one that changes the gate.
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0
+    moving = np.int64(_displacement_px(smoothing.widths.history) * FRACTION)
     if state.known > 0:
-        return changed
+        if state.on_span == gate.choices[0].on_span or moving <= max(2 * state.moving, _STILL):
+            return changed
+        state.known = 0
     if state.half > 0:
         # The gate in use has narrowed the windows, which leave out late events as well.
         half = state.half
@@ -181,20 +232,22 @@ def _learn_gate(columns, half, gate):
     # Rows of background are not those of a line.
     if scatter * FRACTION > half:
         return changed
-    best, least = 0, np.sqrt(_VARIANCE_MAX) * scatter
+    averaged = _columns_averaged(smoothing) * _MEDIAN_DIFFERENCE**2
+    best, least2 = 0, _ERROR2_MAX * scatter * scatter
     for k in range(1, gate.choices.size):
         if _fill_rows(columns, half, gate.choices[k], gated) < _FOUND_MIN * found:
             # A shorter one keeps fewer.
             break
         scatter = _median_difference(gated)
-        if scatter < least and not _move_together(gated, row):
-            best, least = k, scatter
+        error2 = scatter * scatter + averaged * _lag2(row, gated, columns.seeds)
+        if error2 < least2 and not _move_together(gated, row):
+            best, least2 = k, error2
     late = _usual_late(columns, gate.choices[best]) if best > 0 else 0
     # Of columns with more late events than usual all count: where none is usual, of all columns.
     choice = gate.choices[best if late > 0 else 0]
     state.known, state.changed = 1, choice.on_span != state.on_span
     _copy_gate(choice, state)
-    state.late, state.half = late, half
+    state.late, state.half, state.moving = late, half, moving
     return changed
 
 

@@ -325,8 +325,11 @@ def _close(memory):
     blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
     smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
     if gate.choices.size > 0:
-        if _learn_gate(columns, state.half, gate):
+        if _learn_gate(columns, state.half, smoothing, gate):
             _forget_usual(smoothing.widths, memory.bursts)
+            # The events of another gate have another delay and another footprint.
+            memory.delay.time_us = memory.delay.points = 0
+            _restart_from(footprint, memory.known)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated

@@ -86,7 +86,7 @@ class Settings:
     phase_gate_us: int = _number(
         GATE_LEARNED, GATE_LEARNED, GATE_MAX_US, "us",
         "keep only events this soon after their laser edge; 0 is off, -1 takes the time with which "
-        "rows scatter least where it halves their variance",
+        "rows scatter and lag least, where it halves the square of their error",
     )  # fmt: skip
     trigger_source: str = _choice(
         "laser", TRIGGER_SOURCES,

@@ -20,7 +20,7 @@ from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.report.accuracy import true_range_mm
 from eschorty_ros.simulation.pixels import preset
-from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import World, simulate_recording
 
 SEED = 20261121
@@ -236,6 +236,29 @@ def test_a_learned_gate_does_not_move_a_line_that_moves_while_it_is_lit(tmp_path
     moved_px = learned.profiles.row - without.profiles.row
     print(f"rows moved by {moved_px.mean():.3f} px on average")
     assert abs(moved_px.mean()) < 0.03, f"seed {SEED}"
+
+
+@pytest.mark.parametrize(
+    ("scene", "pixels", "speed_mm_s", "travel_mm", "worse"),
+    [
+        (named("face"), "paper", 100.0, (0.0, 200.0), 1.05),
+        (Plane(1100.0, slope_stage=1.2, pivot_mm=40.0), "noisy", 300.0, (10.0, 70.0), 1.4),
+    ],
+    ids=["the first lines are few and weak", "the stage is at rest at first"],
+)
+def test_a_learned_gate_does_not_lag(tmp_path, scene, pixels, speed_mm_s, travel_mm, worse):
+    calibration = load_calibration("config_3")
+    recording = simulate_recording(
+        tmp_path, scene, calibration, Modulation(70.0), *travel_mm, speed_mm_s, 0,
+        parameters=preset(pixels),
+    )  # fmt: skip
+    median_mm = []
+    for found in both(recording):
+        stage_mm = recording.stage.position_mm(found.profiles.t_us)
+        truth_mm = true_range_mm(scene, calibration.model(), stage_mm, found.profiles.column)
+        median_mm.append(np.nanmedian(np.abs(found.profiles.range_mm - truth_mm)))
+    print(f"seed 0: {median_mm} mm without and with a learned gate")
+    assert median_mm[1] < worse * median_mm[0], "seed 0"
 
 
 @pytest.mark.parametrize("case", ["swapped polarity", "wrong frequency"])
