@@ -46,12 +46,16 @@ class CommandParser:
             yield layout.name, body[4] & ~apt.LONG, dict(zip(layout.fields, fields, strict=False))
 
 
-def pack_answer(name: str, source: int, **values: int | bytes) -> bytes:
-    """Return the frame of the message ``name`` to the host; fields not given are 0."""
+def pack_answer(name: str, source: int, *, reserved_bytes: int = 0, **values: int | bytes) -> bytes:
+    """Return the frame of the message ``name`` to the host; fields not given are 0.
+
+    - ``reserved_bytes``: Zeros at its end, where the message may be longer than its fields.
+    """
     layout = _ANSWERS[name]
     fields = [values.get(field, 0) for field in layout.fields]
     if layout.payload:
         payload = struct.pack("<" + layout.payload, *fields)
+        payload += bytes(reserved_bytes * layout.may_be_longer)
         head = struct.pack("<HHBB", layout.id, len(payload), apt.HOST | apt.LONG, source)
         return head + payload
     first, second = (*fields, 0, 0)[:2]

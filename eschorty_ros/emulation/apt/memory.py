@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eschorty_ros.core.clocks.pulses import PulseTrain
 from eschorty_ros.emulation.apt.axis import PulsePattern
-from eschorty_ros.hardware.stage.apt_messages import Scale
+from eschorty_ros.hardware.stage import apt_messages as apt
 
 SETTINGS = frozenset(
     f"set_{kind}"
@@ -21,7 +21,7 @@ class Memory:
     - ``rack``: True for a rack, whose trigger output has messages of its own.
     """
 
-    def __init__(self, scale: Scale, rack: bool) -> None:
+    def __init__(self, scale: apt.Scale, rack: bool) -> None:
         self._scale, self._rack = scale, rack
         self._values: dict[str, Values] = {}
         self.reset()
@@ -30,6 +30,9 @@ class Memory:
         """Return to the settings at power-up."""
         scale = self._scale
         self._values = {
+            name: dict.fromkeys(apt.TO_CONTROLLER[f"set_{name}"].fields, 0)
+            for name in ("ports", "pulses", "rack_trigger")
+        } | {
             "velocity": {
                 "channel": 1,
                 "minimum": 0,

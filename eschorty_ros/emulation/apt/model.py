@@ -34,6 +34,7 @@ class AptModel:
     - ``late_ns``: Extra delay of each frame to the host, as a USB adapter adds.
     - ``on_plan``: Called with every new motion, in the clock's time.
     - ``sampled_pulses``: Trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
+    - ``reserved_bytes``: Reserved bytes at the end of a KBD101's answers about its trigger.
     - ``seed``: Seed of random disturbances.
 
     Public attributes:
@@ -43,6 +44,7 @@ class AptModel:
       enabled; accepts moves without moving.
     - ``extra_bits``: Status bits set on top.
     - ``withheld``: Names of messages it never sends.
+    - ``ignored``: Names of settings it does not take.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class AptModel:
         late_ns: Callable[[], int] | None = None,
         on_plan: Callable[[MotionPlan], None] | None = None,
         sampled_pulses: bool = False,
+        reserved_bytes: int = 12,
         seed: int = 0,
     ) -> None:
         self.scale = apt.Scale()
@@ -65,6 +68,7 @@ class AptModel:
         self.gone = self.mute = self.panel_disabled = self.ignores_moves = False
         self.extra_bits = 0
         self.withheld: set[str] = set()
+        self.ignored: set[str] = set()
         self.disturbance = Disturbance(seed)
         self.axis = Axis(
             clock_ns(), power_up_mm, travel_mm, on_plan or (lambda plan: None), sampled_pulses
@@ -77,6 +81,7 @@ class AptModel:
         self._in = Wire()
         self._out = Wire(late_ns)
         self._commands = CommandParser()
+        self._reserved_bytes = reserved_bytes
         self._memory = Memory(self.scale, self._rack)
         self._power_up()
 
@@ -157,7 +162,8 @@ class AptModel:
                 self._answer(name, at_ns)
 
     def _set(self, name: str, values: dict[str, int]) -> None:
-        self._memory.set(name.removeprefix("set_"), values)
+        if name not in self.ignored:
+            self._memory.set(name.removeprefix("set_"), values)
         self.axis.pattern = self._memory.pattern
 
     def _motion(self, name: str, values: dict[str, int], at_ns: int) -> None:
@@ -201,7 +207,7 @@ class AptModel:
                 self._send_status("status", at_ns)
             case "request_axis":
                 self._send_axis(at_ns)
-            case "request_velocity" | "request_pulses" | "request_rack_trigger":
+            case "request_velocity" | "request_ports" | "request_pulses" | "request_rack_trigger":
                 kind = name.removeprefix("request_")
                 values = self._memory.get(kind)
                 if values is not None:
@@ -256,5 +262,7 @@ class AptModel:
     ) -> None:
         if self.mute or name in self.withheld:
             return
-        frame = self.disturbance.apply(pack_answer(name, source or self._address, **values))
-        self._out.send(frame, self._clock_ns() if at_ns is None else at_ns)
+        frame = pack_answer(
+            name, source or self._address, reserved_bytes=self._reserved_bytes, **values
+        )
+        self._out.send(self.disturbance.apply(frame), self._clock_ns() if at_ns is None else at_ns)

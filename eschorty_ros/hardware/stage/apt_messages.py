@@ -1,7 +1,8 @@
 """Messages of the Thorlabs APT protocol that a brushless stage needs: layouts, scaling, bits.
 
-Host-Controller Protocol Issue 15 for all but the trigger of the BBD30x racks, whose layout is the
-one a published BBD302 driver sends; unconfirmed on hardware.
+Host-Controller Protocol Issue 15 for all but the trigger outputs, which it leaves out. Those of a
+KBD101 are as in the manufacturer's example for its serial port, with 12 reserved bytes at the end;
+those of the BBD30x racks are as a published BBD302 driver sends them. Unconfirmed on hardware.
 """
 
 from __future__ import annotations
@@ -40,11 +41,18 @@ class Layout:
     id: int
     fields: tuple[str, ...] = ()
     payload: str = ""
+    may_be_longer: bool = False
+    """Reserved bytes may follow the payload: public drivers disagree on their number."""
 
     @property
     def payload_bytes(self) -> int:
         """Length of the payload, 0 for a short message."""
         return struct.calcsize("<" + self.payload)
+
+    def fits(self, payload_bytes: int) -> bool:
+        """Return whether a payload of this length is one of this message."""
+        reserved_bytes = payload_bytes - self.payload_bytes
+        return reserved_bytes == 0 or (self.may_be_longer and reserved_bytes > 0)
 
 
 _CHANNEL = ("channel",)
@@ -56,7 +64,7 @@ _PULSES = (
     *("start_reverse", "interval_reverse", "count_reverse"),
     *("width_us", "cycles"),
 )
-_PORTS = ("channel", "mode_1", "polarity_1", "mode_2", "polarity_2", "reserved")
+_PORTS = ("channel", "mode_1", "polarity_1", "mode_2", "polarity_2")
 _RACK_TRIGGER = (
     *("channel", "in_mode", "in_polarity", "in_source", "out_mode", "out_polarity"),
     *_PULSES,
@@ -86,8 +94,9 @@ TO_CONTROLLER: Final = {
         Layout("keep_alive", 0x0492),
         Layout("set_profile_mode", 0x04E3, ("channel", "mode", "jerk"), "2HI4x"),
         Layout("request_axis", 0x04F1, _CHANNEL),
-        Layout("set_ports", 0x0523, _PORTS, "6H"),
-        Layout("set_pulses", 0x0526, ("channel", *_PULSES), "H8i"),
+        Layout("set_ports", 0x0523, _PORTS, "5H12x"),
+        Layout("request_ports", 0x0524, _CHANNEL),
+        Layout("set_pulses", 0x0526, ("channel", *_PULSES), "H8i12x"),
         Layout("request_pulses", 0x0527, _CHANNEL),
     )
 }
@@ -122,7 +131,8 @@ _INCOMING = (
         ),
         "3H16s2I5i24x",
     ),
-    Layout("pulses", 0x0528, ("channel", *_PULSES), "H8i"),
+    Layout("ports", 0x0525, _PORTS, "5H", may_be_longer=True),
+    Layout("pulses", 0x0528, ("channel", *_PULSES), "H8i", may_be_longer=True),
 )
 
 FROM_CONTROLLER: Final[Mapping[int, tuple[Layout, ...]]] = {
@@ -222,7 +232,7 @@ def parse(frame: bytes) -> Frame:
     Raises ``ArgumentError`` when the frame is none of ``FROM_CONTROLLER``.
     """
     layout = _layout(frame)
-    if layout is None or len(frame) != HEADER_BYTES + layout.payload_bytes:
+    if layout is None or len(frame) != HEADER_BYTES + _payload_bytes(frame):
         raise ArgumentError(f"frame is {frame.hex(' ')}; give one complete known message")
     if layout.payload:
         fields = struct.unpack_from("<" + layout.payload, frame, HEADER_BYTES)
@@ -235,17 +245,21 @@ def frame_bytes(header: bytes) -> int:
     """Return the length of the frame that begins with these six bytes, 0 when no frame does."""
     if header[4] & ~LONG not in (0, HOST) or header[5] not in SOURCES:
         return 0
-    layout = _layout(header)
-    return 0 if layout is None else HEADER_BYTES + layout.payload_bytes
+    return 0 if _layout(header) is None else HEADER_BYTES + _payload_bytes(header)
+
+
+def _payload_bytes(header: bytes) -> int:
+    (length,) = struct.unpack_from("<H", header, 2)
+    return int(length) if header[4] & LONG else 0
 
 
 def _layout(header: bytes) -> Layout | None:
-    id, length = struct.unpack_from("<HH", header)
-    size = length if header[4] & LONG else 0
-    for layout in FROM_CONTROLLER.get(id, ()):
-        if layout.payload_bytes == size and bool(size) == bool(header[4] & LONG):
-            return layout
-    return None
+    (id,) = struct.unpack_from("<H", header)
+    size = _payload_bytes(header)
+    # The protocol has no payload above 255 bytes.
+    if bool(size) != bool(header[4] & LONG) or size > 255:
+        return None
+    return next((layout for layout in FROM_CONTROLLER.get(id, ()) if layout.fits(size)), None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -208,23 +208,19 @@ class AptSetup:
             "cycles": _CYCLES,
         }
         self._write_pulses(pulses, _STEPS_BOTH)
-        kind = "pulses" if self._settings.controller == "kbd101" else "rack_trigger"
-        answer = self.request(f"request_{kind}", kind)
-        for name, value in pulses.items():
-            if answer.integer(name) != value:
-                raise DeviceError(
-                    f"stage: the controller keeps trigger {name} {answer.integer(name)} instead of "
-                    f"{value}; set trigger_interval to 0 to go without"
-                )
         return PulseTrain(scale.mm(first), scale.mm(interval), count)
 
     def _write_pulses(self, pulses: dict[str, int], mode: int) -> None:
         port = self._settings.trigger_port
         if self._settings.controller == "kbd101":
+            first, second = (mode if number == port else 0 for number in (1, 2))
+            ports = {"mode_1": first, "polarity_1": 1, "mode_2": second, "polarity_2": 1}
             if pulses:
                 self.send("set_pulses", **pulses)
-            first, second = (mode if number == port else 0 for number in (1, 2))
-            self.send("set_ports", mode_1=first, polarity_1=1, mode_2=second, polarity_2=1)
+                self._check_trigger("pulses", pulses)
+            self.send("set_ports", **ports)
+            if pulses:
+                self._check_trigger("ports", ports)
             return
         self.send("set_rack_trigger_state", state=_DISARM)
         if not pulses:
@@ -241,7 +237,21 @@ class AptSetup:
             out_polarity=1,
             **pulses,
         )
+        self._check_trigger("rack_trigger", pulses)
         self.send("set_rack_trigger_state", state=_ARM)
+
+    def _check_trigger(self, kind: str, requested: dict[str, int]) -> None:
+        remedy = "set trigger_interval to 0 to go without"
+        try:
+            answer = self.request(f"request_{kind}", kind)
+        except DeviceTimeoutError as error:
+            raise DeviceTimeoutError(f"{error}, or {remedy}") from error
+        for name, value in requested.items():
+            if answer.integer(name) != value:
+                raise DeviceError(
+                    f"stage: the controller keeps trigger {name} {answer.integer(name)} instead of "
+                    f"{value}; {remedy}"
+                )
 
 
 def _least(cap: float, counts: int, unit: float) -> float:

@@ -87,3 +87,18 @@ def test_an_incomplete_frame_is_dropped_after_50_ms() -> None:
     assert framer.feed(b"", 51 * MS) == []
     assert framer.broken_frames == 1
     assert positions(framer.feed(status(2), 52 * MS)) == [2]
+
+
+@pytest.mark.parametrize("reserved_bytes", [0, 12])
+def test_answers_about_the_trigger_may_end_with_reserved_bytes(reserved_bytes: int) -> None:
+    fields = struct.pack("<H8i", 1, 40_000, 40_000, 109, 4_360_000, 40_000, 109, 500, 1)
+    size = len(fields) + reserved_bytes
+    head = struct.pack("<HHBB", 0x0528, size, 0x81, 0x50)
+    framer = AptFramer()
+    answer, after = framer.feed(head + fields + bytes(reserved_bytes) + status(3), 0)
+    assert answer.name == "pulses"
+    assert answer.integer("start_reverse") == 4_360_000
+    assert answer.integer("cycles") == 1
+    assert positions([after]) == [3]
+    cut = struct.pack("<HHBB", 0x0528, len(fields) - 1, 0x81, 0x50)
+    assert framer.feed(cut + status(4), 0)[0].name == "status"

@@ -50,14 +50,8 @@ PACKED = [
         apt.pack("set_profile_mode", BAY, mode=0, jerk=100),
         oracle.mot_set_profilemodeparams(BAY, 1, 1, 0, 100),
     ),
-    (
-        apt.pack("set_ports", 0x50, mode_1=15, polarity_1=1, mode_2=0, polarity_2=1),
-        oracle.mot_set_kcubetrigioconfig(0x50, 1, 1, 15, 1, 0, 1),
-    ),
-    (
-        apt.pack("set_pulses", 0x50, **PULSES),
-        oracle.mot_set_kcubeposttrigparams(0x50, 1, 1, *PULSES.values()),
-    ),
+    (apt.pack("request_ports", 0x50), oracle.mot_req_kcubetrigconfig(0x50, 1, 1)),
+    (apt.pack("request_pulses", 0x50), oracle.mot_req_kcubeposttrigparams(0x50, 1, 1)),
 ]
 
 
@@ -77,6 +71,25 @@ def test_frames_of_the_manual() -> None:
     assert scale.velocity(200.0) == 26_843_546
     assert scale.acceleration(2000.0) == 27_488
     assert scale.position(220.0) == 4.4e6
+
+
+def test_trigger_frames_of_the_manufacturers_example() -> None:
+    """The oracle's are 12 bytes shorter than those that Thorlabs sends a KBD101."""
+    ports = apt.pack("set_ports", 0x50, mode_1=2, polarity_1=1, mode_2=0x0B, polarity_2=1)
+    assert ports == bytes.fromhex("23051600d001 0100 0200 0100 0b00 0100") + bytes(12)
+    pulses = {
+        "start_forward": 0,
+        "interval_forward": 0,
+        "count_forward": 1,
+        "start_reverse": 0,
+        "interval_reverse": 0,
+        "count_reverse": 1,
+        "width_us": 50,
+        "cycles": 1,
+    }
+    assert apt.pack("set_pulses", 0x50, **pulses) == bytes.fromhex(
+        "26052e00d001 0100 00000000 00000000 01000000 00000000 00000000 01000000 32000000 01000000"
+    ) + bytes(12)
 
 
 def frame(id: int, payload: bytes, source: int = BAY) -> bytes:

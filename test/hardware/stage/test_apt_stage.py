@@ -1,6 +1,7 @@
 """The stage driver on the emulated controller, in virtual time."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -229,6 +230,26 @@ def test_all_settings_are_written_at_each_connection(bench: AptBench) -> None:
     bench.stage = bench.open()
     for id in (0x0210, 0x0413, 0x0440, 0x04E3, 0x0523, 0x0526):
         assert bench.sent(id), hex(id)
+
+
+@pytest.mark.parametrize("reserved_bytes", [0, 12])
+def test_answers_about_the_trigger_have_either_length(reserved_bytes: int) -> None:
+    bench = AptBench(reserved_bytes=reserved_bytes)
+    begun_ns = bench.clock_ns()
+    bench.move(20.0)
+    assert len(bench.model.trigger_pulses(begun_ns, bench.clock_ns())) > 10
+    assert bench.stage.statistics()["skipped_bytes"] == 0
+
+
+@pytest.mark.parametrize("name", ["set_ports", "set_pulses", "set_rack_trigger"])
+def test_a_trigger_that_the_controller_refuses_is_named(name: str) -> None:
+    bench = AptBench(BAY_2 if "rack" in name else None, home=False)
+    bench.model.reboot()
+    bench.model.ignored = {name}
+    with pytest.raises(DeviceError, match=r"keeps trigger \w+ \d+ instead of \d+; set trigger_int"):
+        bench.open()
+    bench.settings = replace(bench.settings, trigger_interval_mm=0.0)
+    bench.open()
 
 
 def test_a_mute_controller_and_an_empty_bay_are_named() -> None:
