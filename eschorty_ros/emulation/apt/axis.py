@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
-from eschorty_ros.core.clocks.pulses import PulseTrain
 
 SAMPLING_NS = 102_400
 EMERGENCY_MM_S2 = 14_883.0
@@ -18,16 +17,44 @@ _HISTORY_NS = 60_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class PulsePattern:
-    """Position pulses as programmed, for each direction, in mm of the encoder."""
+class PulseLeg:
+    """Pulses in one direction, ``sense`` 1 or -1, each so far on from the one before."""
 
-    forward: PulseTrain | None
-    reverse: PulseTrain | None
+    sense: int
+    start_mm: float
+    interval_mm: float
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class PulseSequence:
+    """Position pulses as programmed, in mm of the encoder: the legs in turn, ``cycles`` times."""
+
+    legs: tuple[PulseLeg, ...]
+    cycles: int
     width_ns: int
+
+    def ahead_mm(self, given: int, sense: int) -> NDArray[np.float64]:
+        """Return the positions left of the leg that is due, if a motion of this sense gives them.
+
+        - ``given``: Pulses since the sequence began.
+        """
+        per_cycle = sum(leg.count for leg in self.legs)
+        if given < self.cycles * per_cycle:
+            given %= per_cycle
+            for leg in self.legs:
+                if given < leg.count:
+                    left = np.arange(given, leg.count if sense == leg.sense else given, dtype=float)
+                    return leg.start_mm + leg.sense * leg.interval_mm * left
+                given -= leg.count
+        return np.empty(0)
 
 
 class Axis:
-    """The true motion of the carriage.
+    """The true motion of the carriage, and the pulses of its trigger output.
+
+    The trigger output is a sequencer: it waits for one position at a time, so that a pulse whose
+    position is never passed in its direction keeps back all that follow.
 
     - ``travel_mm``: Hard ends.
     - ``on_plan``: Called with every new motion.
@@ -44,13 +71,17 @@ class Axis:
     ) -> None:
         self.travel_mm = travel_mm
         self.obstacle_mm: float | None = None
-        self.pattern: PulsePattern | None = None
         self.stalled = False
         self.encoder_offset_mm = position_mm
         self._on_plan = on_plan
         self._sampled = sampled_pulses
-        self._plans: deque[MotionPlan] = deque()
-        self._follow(MotionPlan(at_ns, position_mm))
+        self._sequence: PulseSequence | None = None
+        # Pulses of the sequence, and edges of all, up to a time.
+        self._given = 0
+        self._edges: deque[tuple[int, bool]] = deque()
+        self._given_ns = at_ns
+        self._plans = deque((MotionPlan(at_ns, position_mm),))
+        on_plan(self.plan)
 
     @property
     def plan(self) -> MotionPlan:
@@ -114,32 +145,49 @@ class Axis:
         self.stalled = True
         self._follow(MotionPlan(at_ns, self.position_mm(at_ns)))
 
+    def zero_encoder(self, at_ns: int) -> None:
+        """Let the encoder read 0 at the lower hard end, from now on."""
+        self._give_pulses(at_ns)
+        self.encoder_offset_mm = self.travel_mm[0]
+
+    def begin_pulses(self, at_ns: int, sequence: PulseSequence | None) -> None:
+        """Wait for the first pulse of a sequence from now on, for none with ``None``."""
+        self._give_pulses(at_ns)
+        self._sequence, self._given = sequence, 0
+
     def pulses(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
         """Return the trigger edges from ``from_ns`` to before ``until_ns``: time, rising."""
-        pattern = self.pattern
-        if pattern is None:
-            return []
-        edges: list[tuple[int, bool]] = []
-        ends = [*(plan.start_ns for plan in list(self._plans)[1:]), math.inf]
-        for plan, end_ns in zip(self._plans, ends, strict=True):
-            if min(plan.end_ns, end_ns) + SAMPLING_NS + pattern.width_ns < from_ns:
-                continue
-            for rise_ns in self._rises(plan, pattern):
-                if rise_ns < end_ns:
-                    edges += [(rise_ns, True), (rise_ns + pattern.width_ns, False)]
+        edges = [*self._edges, *self._edges_until(until_ns)]
         return sorted(edge for edge in edges if from_ns <= edge[0] < until_ns)
 
-    def _rises(self, plan: MotionPlan, pattern: PulsePattern) -> list[int]:
-        travelled = plan.end_mm - plan.position_mm
-        train = pattern.forward if travelled > 0.0 else pattern.reverse
-        if travelled == 0.0 or train is None:
+    def _give_pulses(self, until_ns: int) -> None:
+        """Give the pulses that are due, before the motion or the sequence changes."""
+        edges = self._edges_until(until_ns)
+        self._given += len(edges) // 2
+        self._given_ns = max(until_ns, self._given_ns)
+        while self._edges and self._edges[0][0] < until_ns - _HISTORY_NS:
+            self._edges.popleft()
+        self._edges.extend(edges)
+
+    def _edges_until(self, until_ns: int) -> list[tuple[int, bool]]:
+        """Return the edges of the motion under way from the pulses given on."""
+        plan, sequence = self.plan, self._sequence
+        travelled_mm = plan.end_mm - plan.position_mm
+        if sequence is None or travelled_mm == 0.0:
             return []
-        positions = train.first_mm + train.interval_mm * np.arange(train.count)
-        passing_s = plan.passing_s(self.encoder_offset_mm + positions)
-        rises = plan.start_ns + np.rint(passing_s[passing_s > 0.0] * 1e9).astype(np.int64)
+        ahead_mm = sequence.ahead_mm(self._given, 1 if travelled_mm > 0.0 else -1)
+        passing_s = np.nan_to_num(plan.passing_s(self.encoder_offset_mm + ahead_mm), nan=0.0)
+        at_ns = plan.start_ns + np.rint(passing_s * 1e9).astype(np.int64)
+        passed = (passing_s > 0.0) & (at_ns >= self._given_ns) & (at_ns < until_ns)
+        # One position at a time: the first that is not passed keeps back all that follow.
+        rises = at_ns[: int(np.argmin(np.append(passed, False)))]
         if self._sampled:
             rises = -(-rises // SAMPLING_NS) * SAMPLING_NS
-        return [int(rise) for rise in rises]
+        return [
+            edge
+            for rise in rises.tolist()
+            for edge in ((rise, True), (rise + sequence.width_ns, False))
+        ]
 
     def _plan_at(self, at_ns: int) -> MotionPlan:
         for plan in reversed(self._plans):
@@ -148,7 +196,8 @@ class Axis:
         return self._plans[0]
 
     def _follow(self, plan: MotionPlan) -> None:
-        while self._plans and self._plans[0].end_ns < plan.start_ns - _HISTORY_NS:
+        self._give_pulses(plan.start_ns)
+        while self._plans[0].end_ns < plan.start_ns - _HISTORY_NS:
             self._plans.popleft()
         self._plans.append(plan)
         self._on_plan(plan)

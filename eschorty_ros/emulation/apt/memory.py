@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core.clocks.pulses import PulseTrain
-from eschorty_ros.emulation.apt.axis import PulsePattern
+from eschorty_ros.emulation.apt.axis import PulseLeg, PulseSequence
 from eschorty_ros.hardware.stage import apt_messages as apt
 
 SETTINGS = frozenset(
@@ -72,27 +71,28 @@ class Memory:
         return self._values["home"]["velocity"] / self._scale.velocity_unit
 
     @property
-    def pattern(self) -> PulsePattern | None:
-        """Pulses as ports and trigger are set."""
-        ports = self._values.get("ports", {})
-        modes = {ports.get("mode_1"), ports.get("mode_2")}
-        pulses = self._values.get("pulses")
+    def position_mode(self) -> int:
+        """Mode of the output that gives pulses at positions, 0 without one."""
         if self._rack:
-            pulses = self._values.get("rack_trigger")
             wired = self._values.get("rack_port", {}).get("mode") == 1
             armed = self._values.get("rack_trigger_state", {}).get("state") == 1
-            modes = {pulses["out_mode"]} if pulses and wired and armed else set()
-        if pulses is None:
-            return None
-        forward = self._train(pulses, "forward") if modes & {_FORWARD, _BOTH} else None
-        reverse = self._train(pulses, "reverse") if modes & {_REVERSE, _BOTH} else None
-        return PulsePattern(forward, reverse, pulses["width_us"] * 1000)
+            modes = [self._values["rack_trigger"]["out_mode"]] if wired and armed else []
+        else:
+            modes = [self._values["ports"][name] for name in ("mode_1", "mode_2")]
+        return next((mode for mode in modes if mode in (_FORWARD, _REVERSE, _BOTH)), 0)
 
-    def _train(self, pulses: Values, sense: str) -> PulseTrain | None:
-        start, interval, count = (
-            pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
-        )
-        if interval <= 0 or count <= 0:
+    @property
+    def sequence(self) -> PulseSequence | None:
+        """Pulses as ports and trigger are set, ``None`` without an output that gives them."""
+        mode = self.position_mode
+        if not mode:
             return None
-        first = start if sense == "forward" else start - (count - 1) * interval
-        return PulseTrain(self._scale.mm(first), self._scale.mm(interval), count)
+        pulses = self._values["rack_trigger" if self._rack else "pulses"]
+        legs = []
+        for name, sense in (("forward", 1), ("reverse", -1)):
+            if mode in (_BOTH, _FORWARD if sense > 0 else _REVERSE):
+                start_mm, interval_mm = (
+                    self._scale.mm(pulses[f"{field}_{name}"]) for field in ("start", "interval")
+                )
+                legs.append(PulseLeg(sense, start_mm, interval_mm, pulses[f"count_{name}"]))
+        return PulseSequence(tuple(legs), pulses["cycles"], pulses["width_us"] * 1000)

@@ -2,7 +2,9 @@
 
 Its answers follow the protocol description, not the driver: the layouts are shared data, and the
 tests check those against thorlabs-apt-protocol. Behaviour that no source describes is the simplest:
-a move while another is under way is ignored, a homed axis reads 0 at its lower end.
+a move while another is under way is ignored, a homed axis reads 0 at its lower end. Where a source
+leaves open when a setting counts, it counts at the latest: a sequence of pulses is the one that was
+set when the output was switched to it.
 """
 
 from __future__ import annotations
@@ -96,8 +98,8 @@ class AptModel:
         now_ns = self._clock_ns()
         self.axis.stop(now_ns, EMERGENCY_MM_S2)
         self._power_up()
+        self.axis.begin_pulses(now_ns, None)
         self.axis.encoder_offset_mm = self.axis.position_mm(now_ns)
-        self.axis.pattern = self._memory.pattern
 
     @property
     def resting(self) -> bool:
@@ -140,7 +142,7 @@ class AptModel:
             occupied = 1 if values["bay"] == self._bay - 1 else 2
             self._send("bay", apt.RACK, at_ns, bay=values["bay"], state=occupied)
         elif name == "set_rack_port" and address in (apt.RACK, apt.SINGLE_UNIT):
-            self._set(name, values)
+            self._set(name, values, at_ns)
         elif name == "request_info" and (address == self._address or address == apt.RACK):
             self._send_info(address, at_ns)
         elif address == self._address:
@@ -157,14 +159,16 @@ class AptModel:
             case "home" | "move_absolute" | "stop":
                 self._motion(name, values, at_ns)
             case _ if name in SETTINGS:
-                self._set(name, values)
+                self._set(name, values, at_ns)
             case _:
                 self._answer(name, at_ns)
 
-    def _set(self, name: str, values: dict[str, int]) -> None:
+    def _set(self, name: str, values: dict[str, int], at_ns: int) -> None:
+        mode = self._memory.position_mode
         if name not in self.ignored:
             self._memory.set(name.removeprefix("set_"), values)
-        self.axis.pattern = self._memory.pattern
+        if self._memory.position_mode != mode:
+            self.axis.begin_pulses(at_ns, self._memory.sequence)
 
     def _motion(self, name: str, values: dict[str, int], at_ns: int) -> None:
         # A motion begins now, not when its command came: its past was reported already.
@@ -194,7 +198,7 @@ class AptModel:
         end_ns = self.axis.plan.end_ns
         if ended == "homed":
             self.homed = True
-            self.axis.encoder_offset_mm = self.axis.travel_mm[0]
+            self.axis.zero_encoder(end_ns)
             self._send("homed", at_ns=end_ns, channel=1)
         else:
             self._send_status(ended, end_ns)

@@ -176,7 +176,7 @@ class LinearStage(Protocol):
 
     identity: DeviceIdentity
     trigger: PulseTrain | None
-    """Pulses for the camera's trigger input, in either direction; ``None`` when there are none."""
+    """Pulses of moves in either direction for the camera's trigger input; ``None`` for none."""
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
     acceleration_mm_s2: float

@@ -19,9 +19,9 @@ CONTROLLERS = ("kbd101", "bbd30x")
 _ANSWER_S = 0.3
 _ATTEMPTS = 3
 _PULSE_US = 500
-# Larger than the number of passes of any session.
-_CYCLES = 1_000_000
-_STEPS_BOTH = 0x0F
+# At rest the carriage trembles: no pulse may be so near to an end of the move that gives it.
+_PULSE_OFF_END_MM = 0.01
+_STEPS_FORWARD, _STEPS_REVERSE, _OFF = 0x0D, 0x0E, 0
 _OUTPUT = 1
 _ARM, _DISARM = 1, 2
 
@@ -180,16 +180,16 @@ class AptSetup:
         )
 
     def write_trigger(self, axis: AxisData) -> PulseTrain | None:
-        """Program the pulses for the camera over the travel; return them, ``None`` for none.
+        """Switch the pulses for the camera off; return those that moves give, ``None`` for none.
 
-        Raises ``DeviceError`` when the interval does not fit or the controller reads back another
-        pattern.
+        Raises ``DeviceError`` when the interval does not fit or the controller does not take them.
         """
         scale, (low, high) = axis.scale, axis.travel_mm
         interval = scale.position(self._settings.trigger_interval_mm)
+        ports = self._switch_trigger(_OFF)
         if interval == 0:
-            self._write_pulses({}, 0)
             return None
+        self._check_trigger("ports", ports)
         first = scale.position(low) + interval
         count = (scale.position(high) - 1 - first) // interval + 1
         if count < 1:
@@ -197,6 +197,31 @@ class AptSetup:
                 f"stage: trigger interval {scale.mm(interval):g} mm does not fit into the travel; "
                 "choose a shorter one"
             )
+        self._write_pulses(first, interval, count, _STEPS_FORWARD)
+        return PulseTrain(scale.mm(first), scale.mm(interval), count)
+
+    def arm_trigger(
+        self, axis: AxisData, train: PulseTrain, start_mm: float, target_mm: float
+    ) -> None:
+        """Let the next move, from ``start_mm`` to ``target_mm``, give its pulses of ``train``.
+
+        The controller gives a programmed sequence in its order and waits where one of its positions
+        is not passed, so each move has a sequence of its own. Raises ``DeviceError`` when the
+        controller does not take it.
+        """
+        scale = axis.scale
+        self._switch_trigger(_OFF)
+        low, high = sorted((scale.position(start_mm), scale.position(target_mm)))
+        off_end = scale.position(_PULSE_OFF_END_MM)
+        first, interval = scale.position(train.first_mm), scale.position(train.interval_mm)
+        begin = max(-((first - low - off_end) // interval), 0)
+        end = min((high - off_end - first) // interval + 1, train.count)
+        if begin < end:
+            mode = _STEPS_FORWARD if target_mm > start_mm else _STEPS_REVERSE
+            self._write_pulses(first + begin * interval, interval, end - begin, mode)
+            self._check_trigger("ports", self._switch_trigger(mode))
+
+    def _write_pulses(self, first: int, interval: int, count: int, mode: int) -> None:
         pulses = {
             "start_forward": first,
             "interval_forward": interval,
@@ -205,42 +230,32 @@ class AptSetup:
             "interval_reverse": interval,
             "count_reverse": count,
             "width_us": _PULSE_US,
-            "cycles": _CYCLES,
+            "cycles": 1,
         }
-        self._write_pulses(pulses, _STEPS_BOTH)
-        return PulseTrain(scale.mm(first), scale.mm(interval), count)
+        kind = "pulses"
+        if self._settings.controller == "bbd30x":
+            kind = "rack_trigger"
+            port, bay = self._settings.trigger_port, self._settings.bay
+            wiring = apt.pack("set_rack_port", apt.SINGLE_UNIT, port=port, mode=_OUTPUT, source=bay)
+            self._link.send(wiring)
+            pulses |= {"in_mode": _OFF, "in_polarity": 1, "in_source": 0}
+            pulses |= {"out_mode": mode, "out_polarity": 1}
+        self.send(f"set_{kind}", **pulses)
+        self._check_trigger(kind, pulses)
 
-    def _write_pulses(self, pulses: dict[str, int], mode: int) -> None:
-        port = self._settings.trigger_port
-        if self._settings.controller == "kbd101":
-            first, second = (mode if number == port else 0 for number in (1, 2))
-            ports = {"mode_1": first, "polarity_1": 1, "mode_2": second, "polarity_2": 1}
-            if pulses:
-                self.send("set_pulses", **pulses)
-                self._check_trigger("pulses", pulses)
-            self.send("set_ports", **ports)
-            if pulses:
-                self._check_trigger("ports", ports)
-            return
-        self.send("set_rack_trigger_state", state=_DISARM)
-        if not pulses:
-            return
-        bay = self._settings.bay
-        wiring = apt.pack("set_rack_port", apt.SINGLE_UNIT, port=port, mode=_OUTPUT, source=bay)
-        self._link.send(wiring)
-        self.send(
-            "set_rack_trigger",
-            in_mode=0,
-            in_polarity=1,
-            in_source=0,
-            out_mode=mode,
-            out_polarity=1,
-            **pulses,
-        )
-        self._check_trigger("rack_trigger", pulses)
-        self.send("set_rack_trigger_state", state=_ARM)
+    def _switch_trigger(self, mode: int) -> dict[str, int]:
+        """Switch the output to a mode; return what a KBD101 then reads back as ``ports``."""
+        if self._settings.controller == "bbd30x":
+            self.send("set_rack_trigger_state", state=_DISARM if mode == _OFF else _ARM)
+            return {}
+        first, second = (mode * (port == self._settings.trigger_port) for port in (1, 2))
+        ports = {"mode_1": first, "polarity_1": 1, "mode_2": second, "polarity_2": 1}
+        self.send("set_ports", **ports)
+        return ports
 
     def _check_trigger(self, kind: str, requested: dict[str, int]) -> None:
+        if not requested:
+            return
         remedy = "set trigger_interval to 0 to go without"
         try:
             answer = self.request(f"request_{kind}", kind)

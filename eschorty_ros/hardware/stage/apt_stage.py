@@ -142,8 +142,11 @@ class AptStage:
         """Start a move; raises ``DeviceError`` when it is refused or stopped before it begins."""
         with self._lock:
             stops = self._stops
-            self._check_move(self._ready(), position_mm, speed_mm_s)
+            status = self._ready()
+            self._check_move(status, position_mm, speed_mm_s)
         speed, acceleration = self._setup.write_velocity(self._axis, speed_mm_s)
+        if self.trigger is not None:
+            self._setup.arm_trigger(self._axis, self.trigger, status.position_mm, position_mm)
         with self._lock:
             if stops != self._stops:
                 raise DeviceError("stage refused: it was stopped before the move began")

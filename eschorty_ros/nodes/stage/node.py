@@ -90,14 +90,18 @@ class StageNode(DeviceNode):
         )
         with self._lock:
             self._stage = stage
-        self._trigger.publish(self._trigger_message(stage.trigger))
+        # Homing gives none.
+        self._trigger.publish(self._trigger_message(None))
         self.get_logger().info(f"{stage.identity.model} {stage.identity.serial}")
 
     def start_device(self) -> None:
         """Home unless homed, and wait for it."""
         stage = self._opened()
-        if stage.state().homed:
-            return
+        if not stage.state().homed:
+            self._home(stage)
+        self._trigger.publish(self._trigger_message(stage.trigger))
+
+    def _home(self, stage: LinearStage) -> None:
         stage.home()
         limit_s = self.parameters["home_timeout"]
         end_s = time.monotonic() + limit_s

@@ -7,6 +7,7 @@ import thorlabs_apt_protocol as oracle
 
 from eschorty_ros.emulation.apt.model import AptModel
 from eschorty_ros.emulation.apt.wire import BYTE_NS
+from eschorty_ros.hardware.stage import apt_messages as apt
 
 UNIT, BAY_2, RACK = 0x50, 0x22, 0x11
 SECOND = 1_000_000_000
@@ -71,6 +72,59 @@ def test_homing_and_a_move_follow_the_trapezoid() -> None:
     plan = host.model.axis.plan
     assert 0 < plan.start_ns - ordered_ns < 6_000_000
     assert (plan.end_ns - plan.start_ns) * 1e-9 == pytest.approx(0.6, abs=1e-4)
+
+
+class TriggeredHost(Host):
+    """A homed host whose port 1 gives a sequence of position pulses in both directions."""
+
+    def __init__(self, **pulses: int) -> None:
+        super().__init__()
+        self.ask(*ENABLE_AND_HOME, seconds=2.0)
+        ports = {"mode_1": 0x0F, "polarity_1": 1, "mode_2": 0, "polarity_2": 1}
+        self.ask(
+            apt.pack("set_pulses", UNIT, width_us=50, **pulses),
+            apt.pack("set_ports", UNIT, **ports),
+        )
+
+    def pulses(self, target_mm: float) -> list[float]:
+        """Return the positions of the pulses that a move gives, mm."""
+        begun_ns = self.now_ns
+        position = round(target_mm * 20_000)
+        self.ask(oracle.mot_move_absolute(UNIT, 1, 1, position), seconds=5.0)
+        edges = self.model.trigger_pulses(begun_ns, self.now_ns)
+        return [round(self.model.axis.position_mm(at), 2) for at, rising in edges if rising]
+
+
+def test_pulses_of_the_manuals_example() -> None:
+    host = TriggeredHost(
+        start_forward=200_000,
+        interval_forward=100_000,
+        count_forward=2,
+        start_reverse=240_000,
+        interval_reverse=100_000,
+        count_reverse=1,
+        cycles=2,
+    )
+    for forth, back in (([10.0, 15.0], [12.0]), ([10.0, 15.0], [12.0]), ([], [])):
+        assert host.pulses(20.0) == forth
+        assert host.pulses(0.0) == back
+
+
+def test_pulses_wait_for_a_position_that_is_not_passed() -> None:
+    """A sequence over the whole travel is out of step after a sweep over a part of it."""
+    host = TriggeredHost(
+        start_forward=40_000,
+        interval_forward=40_000,
+        count_forward=109,
+        start_reverse=4_360_000,
+        interval_reverse=40_000,
+        count_reverse=109,
+        cycles=1_000_000,
+    )
+    assert host.pulses(61.0) == [2.0 * k for k in range(1, 31)]
+    assert host.pulses(10.0) == []
+    assert host.pulses(61.0) == []
+    assert host.pulses(65.0) == [62.0, 64.0]
 
 
 def test_it_sends_50_statuses_without_a_keep_alive() -> None:

@@ -287,11 +287,12 @@ def test_double_replies_count_once(bench: AptBench) -> None:
 @pytest.mark.fault("late or double reply")
 def test_a_late_reply_is_requested_again() -> None:
     """driver: requests again and drops the late answer; user reads: nothing."""
-    late = {"ns": 0}
-    bench = AptBench(late_ns=lambda: late["ns"])
-    late["ns"] = 350_000_000
+    late_ns: list[int] = []
+    bench = AptBench(late_ns=lambda: late_ns.pop() if late_ns else 0)
+    # Those after it wait for it on the line.
+    late_ns.append(350_000_000)
     bench.stage.move_to(100.0, 100.0)
-    late["ns"] = 0
+    assert not late_ns
     bench.until(lambda: not bench.stage.state().moving, 20.0)
     assert bench.stage.state().position_mm == pytest.approx(100.0, abs=1e-4)
 

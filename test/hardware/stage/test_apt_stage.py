@@ -8,6 +8,7 @@ import pytest
 from apt_bench import EPOCH_NS, SUSPENSION_NS, AptBench
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
+from eschorty_ros.core.clocks import ClockLine, StageTrack, fit_edges
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 
 BAY_2 = AptSettings(controller="bbd30x", bay=2, trigger_port=3)
@@ -197,13 +198,70 @@ def test_pulses_every_2_mm_in_both_directions(settings: AptSettings) -> None:
     assert pulses is not None
     assert (pulses.first_mm, pulses.interval_mm, pulses.count) == (2.0, 2.0, 109)
     expected = [2.0 * (k + 1) for k in range(109)]
-    for target_mm, places in ((220.0, expected), (0.0, expected[::-1])):
-        begun_ns = bench.clock_ns()
-        bench.move(target_mm)
-        edges = bench.model.trigger_pulses(begun_ns, bench.clock_ns())
-        passed = [bench.model.axis.position_mm(t_ns) for t_ns, rising in edges if rising]
-        assert len(edges) == 2 * len(passed)
-        assert passed == pytest.approx(places, abs=1e-3)
+    assert pulses_of_move(bench, 220.0) == pytest.approx(expected, abs=1e-3)
+    assert pulses_of_move(bench, 0.0) == pytest.approx(expected[::-1], abs=1e-3)
+    rising = [up for _, up in bench.model.trigger_pulses(EPOCH_NS, bench.clock_ns())]
+    assert rising == [True, False] * (2 * 109)
+
+
+def pulses_of_move(bench: AptBench, target_mm: float) -> list[float]:
+    """Return the positions of the pulses that a move gives."""
+    begun_ns = bench.clock_ns()
+    bench.move(target_mm)
+    edges = bench.model.trigger_pulses(begun_ns, bench.clock_ns())
+    return [bench.model.axis.position_mm(t_ns) for t_ns, rising in edges if rising]
+
+
+@pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
+def test_every_sweep_over_a_part_of_the_travel_gives_all_its_pulses(settings: AptSettings) -> None:
+    """The pulses at the ends themselves are left out: the carriage may tremble across them."""
+    bench = AptBench(settings)
+    bench.move(10.0)
+    places = [12.0 + 2.0 * k for k in range(24)]
+    for _ in range(3):
+        assert pulses_of_move(bench, 60.0) == pytest.approx(places, abs=1e-3)
+        assert pulses_of_move(bench, 10.0) == pytest.approx(places[::-1], abs=1e-3)
+    assert pulses_of_move(bench, 11.0) == []
+    assert pulses_of_move(bench, 11.5) == []
+    assert pulses_of_move(bench, 12.5) == pytest.approx([12.0], abs=1e-3)
+
+
+def test_pulses_of_sweeps_forth_and_back_give_the_clock() -> None:
+    """By the odometry, and by all positions at which moves may give pulses."""
+    bench = AptBench(sampled_pulses=True)
+    bench.move(10.0)
+    begun_ns = bench.clock_ns()
+    track = StageTrack()
+    for target_mm in (60.0, 10.0, 60.0):
+        bench.stage.move_to(target_mm, 100.0)
+        while bench.stage.state().moving:
+            bench.advance(0.01)
+            state = bench.stage.state()
+            track.append([state.t_ns // 1000], [state.position_mm])
+    edges = bench.model.trigger_pulses(begun_ns, bench.clock_ns())
+    rises_us = np.array([t_ns - EPOCH_NS for t_ns, rising in edges if rising]) // 1000
+    late = ClockLine(0, EPOCH_NS + 7_000_000)
+    fit = fit_edges(rises_us, track, bench.stage.trigger, late)
+    assert (fit.used, fit.missing, fit.spurious) == (3 * 24, 0, 0)
+    error_us = (fit.line.to_ns(rises_us) - EPOCH_NS) // 1000 - rises_us
+    assert np.abs(error_us).max() < 100
+
+
+def test_a_sweep_after_one_that_was_stopped_gives_all_its_pulses(bench: AptBench) -> None:
+    bench.stage.move_to(200.0, 100.0)
+    bench.advance(0.5)
+    bench.stage.stop()
+    bench.until(lambda: not bench.stage.state().moving)
+    before_mm = bench.true_mm
+    places = [place for place in np.arange(2.0, before_mm, 2.0) if place > 10.0]
+    assert pulses_of_move(bench, 10.0) == pytest.approx(places[::-1], abs=1e-3)
+
+
+def test_homing_gives_no_pulses() -> None:
+    bench = AptBench(home=False, power_up_mm=150.0)
+    bench.stage.home()
+    bench.until(lambda: bench.stage.state().homed, 30.0)
+    assert bench.model.trigger_pulses(EPOCH_NS, bench.clock_ns()) == []
 
 
 def test_sampled_pulses_are_late_by_one_cycle_at_most() -> None:
