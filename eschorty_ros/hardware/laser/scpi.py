@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TypeVar
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
@@ -79,7 +80,9 @@ class Scpi:
             except (DeviceGoneError, VoidedError):
                 raise
             except DeviceError:
-                self._link.clear()
+                # If it fails, so does the next command, which clears it once more.
+                with suppress(DeviceError):
+                    self._link.clear()
                 return None
             match = re.match(r"\s*([-+]?\d+)\s*(,.*)?$", reply)
             if match is None:

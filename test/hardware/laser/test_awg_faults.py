@@ -194,12 +194,28 @@ def test_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
     assert laser.readback().counters["faults"] == 1
 
 
+@pytest.fixture
+def profile(tmp_path: Path) -> str:
+    """A profile of a generator with an error queue."""
+    path = tmp_path / "awg_queue.yaml"
+    text = (Path(__file__).parents[3] / "config" / "awg_utg900e.yaml").read_text("utf-8")
+    path.write_text(f'{text}error_queue: ":SYSTem:ERRor?"\n', "utf-8")
+    return str(path)
+
+
+def test_a_generator_without_an_error_queue_is_asked_for_none(bench: AwgBench) -> None:
+    laser = bench.laser()
+    laser.configure(SQUARE)
+    assert not [c for c in bench.model.commands if "ERR" in c]
+    assert laser.readback().counters["faults"] == 0
+
+
 @pytest.mark.parametrize("errors", [None, [], ['-222,"Data out of range"', '-113,"Undefined"']])
 @pytest.mark.fault("error queue")
-def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
+def test_error_queue(bench: AwgBench, profile: str, errors: list[str] | None) -> None:
     """driver: reads it once at opening, no reply means none, empties it; user reads: a warning per entry."""  # noqa: E501
     bench.model.errors = None if errors is None else type(bench.model.commands)(errors)
-    laser = bench.laser()
+    laser = bench.laser(profile=profile)
     warnings = laser.readback().warnings
     assert len(warnings) == len(errors or [])
     assert all(error in text for error, text in zip(errors or [], warnings, strict=True))
@@ -209,18 +225,30 @@ def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
 
 
 @pytest.mark.fault("error queue")
-def test_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_queue_whose_probe_cannot_be_cleared(bench: AwgBench, profile: str) -> None:
+    """driver: goes on, the next command clears the link if it must; user reads: nothing."""
+    bench.model.faults.pending_clears = 100
+    laser = bench.laser(profile=profile)
+    assert bench.model.faults.pending_clears < 100
+    laser.configure(SQUARE)
+    assert laser.readback().warnings == ()
+
+
+@pytest.mark.fault("error queue")
+def test_error_queue_without_end(
+    bench: AwgBench, profile: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """driver: reads 32 entries, or none when they are garbage, and goes on; user reads: 32 warnings at most."""  # noqa: E501
     queried = bench.model._queried
     reply = ['-350,"Queue overflow"']
     monkeypatch.setattr(
         bench.model, "_queried", lambda path: reply[0] if "ERR" in path else queried(path)
     )
-    bench.laser().close()
+    bench.laser(profile=profile).close()
     assert sum("ERR" in c for c in bench.model.commands) == 32
     bench.model.commands.clear()
     reply[0] = "<?garbage"
-    laser = bench.laser()
+    laser = bench.laser(profile=profile)
     assert sum("ERR" in c for c in bench.model.commands) == 1
     laser.configure(SQUARE)
 
