@@ -35,6 +35,7 @@ class ChannelState:
     low_v: float = -0.05
     duty_percent: float = 50.0
     phase_deg: float = 0.0
+    amplitude_unit: str = "VPP"
     load_ohm: float = HIGH_Z_OHM
     inversion: bool = False
     limit: bool = False
@@ -176,6 +177,7 @@ CHANNEL_COMMANDS = (
     _level("BASE:LOW", "low_v"),
     _value("BASE:DUTY", "duty_percent", 0.1, 99.9, 3),
     _value("BASE:PHASe", "phase_deg", -360.0, 360.0, 2),
+    _word("AMPLitude:UNIT", "amplitude_unit", ("VPP", "VRMS")),
     _command("LOAD", _put_load, lambda state: _plain(state.load_ohm, 0)),
     _word("BURSt:TYPe", "burst_type", ("NCYC", "GATe", "INFinit")),
     _value("BURSt:CYCLes", "burst_cycles", 1.0, 1e6, 0),

@@ -26,7 +26,7 @@ def requested_settings(
 ) -> Requested:
     """Return every setting of a lit output, in the order in which it is safe to make them.
 
-    The load is first, since it changes what a volt means; then the clamp, before any level.
+    Unit and load are first, since they change what a volt means; then the clamp, before any level.
     ``counted``: as a burst of counted cycles. It starts in the middle of the dark part of a period,
     since some generators hold the level of that phase between bursts.
 
@@ -37,6 +37,7 @@ def requested_settings(
             f"waveform is {modulation.waveform!r}; the generator has {', '.join(profile.waveforms)}"
         )
     requested: Requested = {
+        "amplitude_unit": "VPP",
         "load": settings.load_ohm,
         "limit_lower": 0.0,
         "limit_upper": settings.high_max_v,

@@ -18,6 +18,7 @@ from eschorty_ros.core.base.yaml_file import read_yaml
 
 SETTINGS = (
     "output",
+    "amplitude_unit",
     "load",
     "limit_enable",
     "limit_lower",

@@ -264,6 +264,7 @@ def test_error_queue_without_end(
         ("INVersion", "ON", "inversion is True instead of False"),
         ("BASE:WAVe", "SINe", "waveform is SINE instead of SQUare"),
         ("MODe", "AM", "mode is AM instead of CONTinue"),
+        ("AMPLitude:UNIT", "VRMS", "amplitude_unit is VRMS instead of VPP"),
         ("LOAD", "50", "load is 50 instead of 10000"),
     ],
 )

@@ -60,6 +60,7 @@ def test_settings_are_made_in_the_safe_order(bench: AwgBench) -> None:
         "TRIGger:SOURce MANUAL",
         "BURSt:CYCLes 2",
         "BURSt:PHASe 270",
+        "AMPLitude:UNIT VPP",
         "LOAD 10000",
         "LIMit:LOWer 0",
         "LIMit:UPPer 5",
@@ -83,6 +84,12 @@ def test_settings_are_made_in_the_safe_order(bench: AwgBench) -> None:
     assert not bench.model.lit
 
 
+def test_a_unit_that_was_left_at_the_panel_is_set_back(bench: AwgBench) -> None:
+    bench.model.touch("AMPLitude:UNIT", "VRMS")
+    bench.lit_laser()
+    assert bench.model.channels[0].amplitude_unit == "VPP"
+
+
 def test_one_command_per_message(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
     messages: list[str] = []
     execute = bench.model._execute
@@ -100,9 +107,14 @@ def test_enable_reads_all_back_before_and_the_output_after(bench: AwgBench) -> N
     sent = list(bench.model.commands)
     on = sent.index(":CHANnel1:OUTPut ON")
     assert sent[on - 1] == ":SYSTem:LOCK OFF"
-    assert {"LOAD?", "LIMit:UPPer?", "BASE:HIGH?", "BASE:DUTY?", "INVersion?"} <= {
-        text.removeprefix(":CHANnel1:") for text in sent[:on]
-    }
+    assert {
+        "AMPLitude:UNIT?",
+        "LOAD?",
+        "LIMit:UPPer?",
+        "BASE:HIGH?",
+        "BASE:DUTY?",
+        "INVersion?",
+    } <= {text.removeprefix(":CHANnel1:") for text in sent[:on]}
     assert sent[on + 1 :] == ["*TRG", ":CHANnel1:OUTPut?", ":SYSTem:LOCK OFF"]
 
 

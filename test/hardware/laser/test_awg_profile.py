@@ -19,7 +19,7 @@ def test_profile_is_found_by_name_and_by_path() -> None:
     ("before", "after", "text"),
     [
         ("channels: 2", "chanels: 2", "chanels is 2, and no such key exists; did you mean"),
-        ("kind: keyword", "kind: letters", "settings.mode.kind is 'letters'"),
+        ("kind: keyword", "kind: letters", "settings.amplitude_unit.kind is 'letters'"),
         ("channels: 2", "channels: two", "channels is 'two'"),
         ("BASE:DUTY", "BASE:{duty}", "only {channel} can be filled in"),
         ("  duty:\n", "  share:\n", "; add duty"),
