@@ -58,6 +58,8 @@ class AwgSettings:
         "s",
         range=(0.0, GRANT_MAX_S),
     )
+    # A switch-off first waits for the transfer under way, and fails after several waits of its own;
+    # a renewal waits for one, too. More would exceed the 2 s of the one and the grant of the other.
     usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 0.2))
 
     def __post_init__(self) -> None:
