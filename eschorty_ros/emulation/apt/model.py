@@ -18,8 +18,9 @@ from eschorty_ros.emulation.apt.memory import SETTINGS, Memory
 from eschorty_ros.emulation.apt.wire import Disturbance, Wire
 from eschorty_ros.hardware.stage import apt_messages as apt
 
-# Status messages sent after the last keep-alive.
+# Status messages sent after the last keep-alive; then nothing is sent until the next one.
 _UNACKNOWLEDGED_MAX = 50
+_STATUSES = ("status", "moved", "stopped")
 
 
 class AptModel:
@@ -239,9 +240,6 @@ class AptModel:
         )
 
     def _send_status(self, name: str, at_ns: int) -> None:
-        self._unacknowledged += 1
-        if self._unacknowledged > _UNACKNOWLEDGED_MAX:
-            return
         velocity = self.axis.velocity_mm_s(at_ns) * self.scale.counts_per_mm * self.scale.cycle_s
         self._send(
             name,
@@ -264,8 +262,10 @@ class AptModel:
     def _send(
         self, name: str, source: int = 0, at_ns: int | None = None, **values: int | bytes
     ) -> None:
-        if self.mute or name in self.withheld:
+        halted = self._unacknowledged >= _UNACKNOWLEDGED_MAX
+        if self.mute or halted or name in self.withheld:
             return
+        self._unacknowledged += name in _STATUSES
         frame = pack_answer(
             name, source or self._address, reserved_bytes=self._reserved_bytes, **values
         )

@@ -89,6 +89,8 @@ class AptStage:
             raise
 
     def _connect(self) -> None:
+        # First: a controller that a program has left without it for long answers nothing before.
+        self._link.call_every(lambda: _KEEP_ALIVE_S, self._keep_alive)
         self._setup.send("stop_updates")
         # The program that used it before may have left it moving.
         self._setup.send("stop", mode=_PROFILED)
@@ -103,7 +105,6 @@ class AptStage:
         self.trigger = self._setup.write_trigger(axis)
         self._setup.send("set_enabled", state=_ON)
         self._tracker.begin_motion(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
-        self._link.call_every(lambda: _KEEP_ALIVE_S, self._keep_alive)
         self._link.call_every(self._poll_s, self.request_status)
         self._link.call_every(lambda: _HEALTH_S, self._check_health)
         if not self._link.wait_until(lambda: self._tracker.status is not None, _FIRST_STATUS_S):

@@ -127,10 +127,10 @@ def test_pulses_wait_for_a_position_that_is_not_passed() -> None:
     assert host.pulses(65.0) == [62.0, 64.0]
 
 
-def test_it_sends_50_statuses_without_a_keep_alive() -> None:
+def test_it_sends_50_statuses_without_a_keep_alive_and_then_nothing() -> None:
     host = Host()
     assert len(host.ask(*[STATUS] * 60, seconds=1.0)) == 50
-    assert host.ask(STATUS) == []
+    assert host.ask(STATUS, oracle.hw_req_info(UNIT, 1)) == []
     assert len(host.ask(oracle.mot_ack_dcstatusupdate(UNIT, 1), STATUS)) == 1
 
 

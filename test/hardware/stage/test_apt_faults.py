@@ -206,6 +206,18 @@ def test_the_keep_alive_is_sent_twice_a_second(bench: AptBench) -> None:
 
 
 @pytest.mark.fault("keep-alive missing")
+def test_a_controller_that_a_program_left_without_it_opens(bench: AptBench) -> None:
+    """driver: sends it first, which frees the controller's answers; user reads: nothing."""
+    bench.link = None
+    for _ in range(60):
+        bench.model.feed(apt_messages.pack("request_status", apt_messages.SINGLE_UNIT))
+        bench.advance(0.01)
+        bench.model.step()
+    bench.stage = bench.open()
+    bench.move(20.0)
+
+
+@pytest.mark.fault("keep-alive missing")
 def test_without_keep_alive_the_link_fails(bench: AptBench) -> None:
     """driver: fails as on a dead link; user reads: sent no status for 1.5 s; check its power ..."""
     for timer in bench.link._timers:
