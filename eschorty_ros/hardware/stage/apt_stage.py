@@ -21,7 +21,8 @@ from eschorty_ros.hardware.stage.apt_status import Status
 from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, Kind, Tracker
 
 _MOVE_NS = 12 * BYTE_NS
-_KEEP_ALIVE_S = 0.5
+# A controller sends 50 status messages without one.
+_KEEP_ALIVE_S, _KEEP_ALIVE_STATUSES = 0.5, 20
 _HEALTH_S = 0.05
 _ENABLE_S = 10.0
 _FIRST_STATUS_S = 1.5
@@ -77,6 +78,7 @@ class AptStage:
         self._closed = False
         # Both counters show a stop and an order that cross, on either side.
         self._stops = self._orders = 0
+        self._unacknowledged = 0
         # Frames that come at once wait for the tracker.
         with self._lock:
             self._link = make_link(self._on_frame, self._on_lost)
@@ -269,6 +271,7 @@ class AptStage:
     # Timers, in the writer's thread
 
     def _keep_alive(self) -> None:
+        self._unacknowledged = 0
         self._link.write(apt.pack("keep_alive", self._settings.address))
 
     def _poll_s(self) -> float:
@@ -301,6 +304,9 @@ class AptStage:
         if frame.source != self._settings.address and not frame.name.startswith("error"):
             return
         with self._lock:
+            self._unacknowledged += frame.name in ("status", "moved", "stopped")
+            if self._unacknowledged >= _KEEP_ALIVE_STATUSES:
+                self._keep_alive()
             match frame.name:
                 case "status":
                     self._tracker.add_status(frame, received_ns, clock_ns)

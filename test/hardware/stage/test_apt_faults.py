@@ -206,6 +206,17 @@ def test_the_keep_alive_is_sent_twice_a_second(bench: AptBench) -> None:
 
 
 @pytest.mark.fault("keep-alive missing")
+def test_the_keep_alive_is_sent_as_often_as_fast_polling_needs_it() -> None:
+    """driver: sends it after 20 status messages at the latest; user reads: nothing."""
+    bench = AptBench(AptSettings(poll_hz=200.0))
+    bench.stage.move_to(200.0, 50.0)
+    before = bench.stage.statistics()["frames"]
+    bench.advance(2.0)
+    assert bench.stage.statistics()["frames"] - before > 380
+    assert bench.stage.healthy
+
+
+@pytest.mark.fault("keep-alive missing")
 def test_a_controller_that_a_program_left_without_it_opens(bench: AptBench) -> None:
     """driver: sends it first, which frees the controller's answers; user reads: nothing."""
     bench.link = None
@@ -220,9 +231,8 @@ def test_a_controller_that_a_program_left_without_it_opens(bench: AptBench) -> N
 @pytest.mark.fault("keep-alive missing")
 def test_without_keep_alive_the_link_fails(bench: AptBench) -> None:
     """driver: fails as on a dead link; user reads: sent no status for 1.5 s; check its power ..."""
-    for timer in bench.link._timers:
-        if timer.period_s() == 0.5:
-            timer.action = lambda: None
+    write = bench.port.write
+    bench.port.write = lambda data: write(b"" if data[:2] == b"\x92\x04" else data)
     assert "sent no status for 1.5 s" in bench.failure(10.0)
 
 
