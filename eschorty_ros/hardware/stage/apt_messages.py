@@ -156,7 +156,7 @@ STATUS_BITS: Final = {
     0x00001000: "tracking",
     0x00002000: "settled",
     0x00004000: "position_error",
-    0x00008000: "instrument_error",
+    0x00008000: "command_error",
     0x00010000: "interlock",
     0x00020000: "over_temperature",
     0x00040000: "supply_voltage_fault",
@@ -179,13 +179,24 @@ MOVING: Final = 0xF0
 HOMED: Final = 0x400
 SETTLED: Final = 0x2000
 POSITION_ERROR: Final = 0x4000
-FAULTS: Final = 0x4E0E_8000
+COMMAND_ERROR: Final = 0x8000
+ERROR: Final = 0x4000_0000
+FAULTS: Final = 0x4E0E_0000
 ENABLED: Final = 0x8000_0000
 
 
 def decode_bits(bits: int) -> tuple[str, ...]:
     """Return the names of the status bits that are set."""
     return tuple(name for mask, name in STATUS_BITS.items() if bits & mask)
+
+
+def axis_faults(bits: int) -> int:
+    """Return the status bits that are faults of the axis.
+
+    A command that the controller refuses is none, nor is the bit of any error that comes with it.
+    """
+    faults = bits & FAULTS
+    return 0 if faults == ERROR and bits & COMMAND_ERROR else faults
 
 
 @dataclass(frozen=True, slots=True)

@@ -203,6 +203,7 @@ class AptStage:
             "status_age_s": self._tracker.age_ns * 1e-9,
             "statuses_rejected": self._tracker.checks.rejected,
             "late_statuses": fit.late_readings,
+            "command_errors": self._tracker.command_errors,
             "clock_sets": self._tracker.clock_sets,
             "frames": framer.frames,
             "skipped_bytes": framer.skipped_bytes,

@@ -16,7 +16,7 @@ from eschorty_ros.hardware.stage import apt_messages as apt
 LATE_NS = 500_000_000
 _REST_MARGIN_MM = 0.02
 _MOVE_MARGIN_MM = 1.0
-_CRITICAL = apt.HOMED | apt.ENABLED | apt.FAULTS | apt.LIMITS
+_CRITICAL = apt.HOMED | apt.ENABLED | apt.FAULTS | apt.COMMAND_ERROR | apt.LIMITS
 
 
 class Plausibility(Enum):

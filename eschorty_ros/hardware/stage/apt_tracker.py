@@ -75,6 +75,7 @@ class Tracker:
     - ``motion``: The motion under way.
     - ``status``: The newest message that was used.
     - ``blocked_sense``: Sign of the direction that a limit has barred.
+    - ``command_errors``: Times the controller began to report a refused command.
     - ``clock_sets``: Times the clock was set. The rest of a motion under way then follows readings
       alone.
     """
@@ -89,6 +90,7 @@ class Tracker:
         self.status: Status | None = None
         self.failure: DeviceError | None = None
         self.blocked_sense = 0
+        self.command_errors = 0
         self.clock_sets = 0
         self._actions = actions
         self._now_ns, self._clock_ns = now_ns, clock_ns
@@ -234,6 +236,8 @@ class Tracker:
 
     def _use(self, status: Status, plausibility: Plausibility) -> None:
         before, self.status = self.status, status
+        known = 0 if before is None else before.bits
+        self.command_errors += bool(status.bits & ~known & apt.COMMAND_ERROR)
         if self.failure is not None:
             if before is not None and before.position_mm == status.position_mm:
                 self.motion = None
@@ -264,8 +268,8 @@ class Tracker:
                     f"the stage's encoder jumped by {jump_mm:.3f} mm; home again and check the "
                     "encoder's cable"
                 )
-        if status.bits & apt.FAULTS:
-            names = ", ".join(apt.decode_bits(status.bits & apt.FAULTS))
+        if faults := apt.axis_faults(status.bits):
+            names = ", ".join(apt.decode_bits(faults))
             return DeviceError(f"the stage controller reports {names}; clear its cause")
         return None
 

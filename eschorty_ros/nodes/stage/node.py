@@ -62,6 +62,7 @@ class StageNode(DeviceNode):
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
         self.moves = 0
+        self._command_errors = 0.0
         self._published_ns, self._rested = 0, False
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(_ODOM_DEPTH))
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
@@ -284,6 +285,8 @@ class StageNode(DeviceNode):
             state = stage.state()
         except EschortyError as error:
             return diagnostics.ERROR, str(error), {"state": self.state_label}
+        statistics = stage.statistics()
+        known, self._command_errors = self._command_errors, statistics.get("command_errors", 0.0)
         values = {
             "device": stage.identity.model,
             "state": self.state_label,
@@ -293,10 +296,12 @@ class StageNode(DeviceNode):
             "moving": state.moving,
             "flags": " ".join(state.flags),
             "moves": self.moves,
-            **stage.statistics(),
+            **statistics,
         }
         if self.active and not state.homed:
             return diagnostics.WARN, "not homed", values
+        if self._command_errors > known:
+            return diagnostics.WARN, "the stage controller refused a command", values
         return diagnostics.OK, "moving" if state.moving else "at rest", values
 
 

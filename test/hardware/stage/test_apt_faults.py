@@ -280,6 +280,17 @@ def test_reported_faults_stop_the_stage(moving: AptBench) -> None:
     assert at_rest(moving)
 
 
+@pytest.mark.parametrize("any_error", [0, 0x4000_0000])
+@pytest.mark.fault("controller reports an error")
+def test_a_refused_command_is_no_fault_of_the_axis(moving: AptBench, any_error: int) -> None:
+    """driver: counts it and goes on; user reads: the stage controller refused a command, once."""
+    moving.model.extra_bits = 0x8000 | any_error
+    moving.until(lambda: not moving.stage.state().moving)
+    assert moving.stage.state().position_mm == pytest.approx(200.0, abs=1e-4)
+    assert "command_error" in moving.stage.state().flags
+    assert moving.stage.statistics()["command_errors"] == 1
+
+
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("controller rebooted")
 def test_a_restarted_controller_must_be_homed(bench: AptBench, rests: bool) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from benches import bench_here
+from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger
 from nav_msgs.msg import Odometry
@@ -146,6 +147,21 @@ def test_deactivate_stops_a_move(stage: Stage) -> None:
     assert "stopped at" in outcome.result.message
     assert "inactive" in stage.move(0.1, 0.1).result.message
     assert stage.observer.change_state("stage", "activate")
+
+
+def test_a_refused_command_is_one_warning(stage: Stage) -> None:
+    reports = stage.observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+    stage.emulated.stage.extra_bits = 0x8000
+
+    def messages() -> list[str]:
+        statuses = [status for report in list(reports) for status in report.status]
+        return [status.message for status in statuses if "stage" in status.name]
+
+    refused = "the stage controller refused a command"
+    wait_until(lambda: refused in messages(), "the warning")
+    wait_until(lambda: len(messages()) >= messages().index(refused) + 3, "later diagnostics")
+    assert messages().count(refused) == 1
+    stage.emulated.stage.extra_bits = 0
 
 
 def test_interrupt_in_a_move_exits_clean(stage: Stage) -> None:
