@@ -233,8 +233,14 @@ class StageNode(DeviceNode):
     def _stream_odom(self) -> None:
         """Publish the odometry until the node ends; a timer of rclpy costs much more."""
         while not ends(self):
-            with unless_shut_down(self):
+            try:
                 self._publish_odom()
+            except EschortyError as error:
+                self.fault(f"stage lost: {error}")
+            except Exception as error:
+                # A signal ends the context while this thread may be publishing.
+                if not ends(self):
+                    self.fault(f"odometry failed: {error!r}")
             if self._rested:
                 self._begun.wait(REST_NS * 1e-9)
                 self._begun.clear()
@@ -245,13 +251,8 @@ class StageNode(DeviceNode):
         stage = self._stage
         if stage is None:
             return
-        try:
-            period_ns = round(1e9 / self.parameters["odom_rate"])
-            states = states_since(stage, self._published_ns, period_ns, self._rested)
-        except EschortyError as error:
-            self.fault(f"stage lost: {error}")
-            return
-        for state in states:
+        period_ns = round(1e9 / self.parameters["odom_rate"])
+        for state in states_since(stage, self._published_ns, period_ns, self._rested):
             self._published_ns, self._rested = state.t_ns, not state.moving
             self._odom.publish(self._odometry(state))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import NodeProcess, Observer, wait_until
+from std_msgs.msg import Empty
 
 from eschorty_ros.emulation.apt.model import AptModel
 from eschorty_ros.emulation.bus import PtyPort
@@ -16,14 +17,18 @@ from eschorty_ros.nodes.ros import qos
 
 @contextlib.contextmanager
 def running(
-    tmp_path: Path, observer: Observer, power_up_mm: float, homing_speed: float
+    tmp_path: Path,
+    observer: Observer,
+    power_up_mm: float,
+    homing_speed: float,
+    module: str = "eschorty_ros.nodes.stage.node",
 ) -> Iterator[tuple[AptModel, NodeProcess]]:
     """The emulated controller and the node, which ends well."""
     model, port = AptModel(time.time_ns, power_up_mm=power_up_mm), tmp_path / "stage"
     settings = {"driver": "apt", "homing_speed": homing_speed, "port": port}
     with (
         PtyPort(model, port),
-        NodeProcess("eschorty_ros.nodes.stage.node", settings, domain=observer.domain) as process,
+        NodeProcess(module, settings, domain=observer.domain) as process,
     ):
         yield model, process
         assert process.interrupt() == 0
@@ -50,6 +55,16 @@ def test_an_unplugged_stage_makes_the_node_leave_active(tmp_path: Path, observer
         model.gone = False
         wait_until(lambda: observer.change_state("stage", "configure"), "the port open again")
         assert observer.change_state("stage", "activate")
+
+
+def test_an_odometry_that_fails_makes_the_node_leave_active(
+    tmp_path: Path, observer: Observer
+) -> None:
+    with running(tmp_path, observer, 2.0, 0.1, "breakable_stage") as (_, process):
+        observer.wait_for_state("stage", "active")
+        observer.publisher(Empty, "test/break", 10).publish(Empty())
+        wait_until(lambda: "odometry failed: ValueError('no number')" in process.output, "the log")
+        observer.wait_for_state("stage", "unconfigured")
 
 
 @pytest.mark.fault("shutdown at any time")
