@@ -85,7 +85,7 @@ class CameraNode(DeviceNode):
             qos.events(),
             qos_overriding_options=qos.overridable(),
         )
-        self._packets = PacketPublisher(events, 1280, 720, self.parameters["frame_id"])
+        self._packets = PacketPublisher(events, self.parameters["frame_id"])
         self.create_subscription(
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
@@ -124,7 +124,9 @@ class CameraNode(DeviceNode):
         source = self._source
         if source is None:
             raise DeviceError("camera refused: not open; configure it first")
-        self._packets.set_thresholds(
+        self._packets.begin(
+            source.width,
+            source.height,
             round(self.parameters["event_message_time_threshold"] * 1e9),
             self.parameters["event_message_size_threshold"],
         )

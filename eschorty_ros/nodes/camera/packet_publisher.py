@@ -29,7 +29,7 @@ class PacketPublisher:
     - ``on``, ``off``: Events by polarity, published or not.
     """
 
-    def __init__(self, publisher: Any, width: int, height: int, frame_id: str) -> None:
+    def __init__(self, publisher: Any, frame_id: str) -> None:
         self.seq = 0
         self.packets = 0
         self.published_bytes = 0
@@ -39,8 +39,7 @@ class PacketPublisher:
         self.off = 0
         self._decoder = Decoder(width, height)
         self._publisher = publisher
-        self._width = width
-        self._height = height
+        self._width = self._height = 0
         self._frame_id = frame_id
         self._gap = False
         self._packetizer = Packetizer(0, 2)
@@ -69,8 +68,9 @@ class PacketPublisher:
     def dark(self, value: bool) -> None:
         self._packetizer.dark = value
 
-    def set_thresholds(self, age_ns: int, size_bytes: int) -> None:
-        """Publish packets at this age or size."""
+    def begin(self, width: int, height: int, age_ns: int, size_bytes: int) -> None:
+        """Publish a sensor of so many columns and rows in packets at this age or size."""
+        self._width, self._height = width, height
         self._packetizer = Packetizer(age_ns, size_bytes, self.dark)
 
     def push(self, chunk: EventChunk | None, now_ns: int) -> None:

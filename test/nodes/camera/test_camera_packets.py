@@ -10,12 +10,20 @@ class Publisher:
     def __init__(self):
         self.subscribers = 1
         self.seqs = []
+        self.sizes = set()
 
     def get_subscription_count(self):
         return self.subscribers
 
     def publish(self, message):
         self.seqs.append(message.seq)
+        self.sizes.add((message.width, message.height))
+
+
+def begun(publisher):
+    packets = PacketPublisher(publisher, "f")
+    packets.begin(640, 480, 0, 2)
+    return packets
 
 
 def push(packets, count, **marks):
@@ -25,16 +33,17 @@ def push(packets, count, **marks):
 
 def test_gaps_and_restarts_show_in_the_numbers():
     publisher = Publisher()
-    packets = PacketPublisher(publisher, 1280, 720, "f")
+    packets = begun(publisher)
     push(packets, 3)
     push(packets, 2, gap=True)
     push(packets, 2, restarted=True)
     assert publisher.seqs == [0, 1, 2, 4, 5, 0, 1]
+    assert publisher.sizes == {(640, 480)}
 
 
 def test_bytes_without_a_subscriber_are_a_gap_after_the_first_packet():
     publisher = Publisher()
-    packets = PacketPublisher(publisher, 1280, 720, "f")
+    packets = begun(publisher)
     publisher.subscribers = 0
     push(packets, 5)
     publisher.subscribers = 1
