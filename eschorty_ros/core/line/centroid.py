@@ -95,8 +95,8 @@ class Rows(NamedTuple):
     ambiguous: NDArray[np.bool_]
 
 
-class PeriodSums(NamedTuple):
-    """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns.
+class LineSums(NamedTuple):
+    """Pooled sum of squares of the rows used, with its degrees of freedom.
 
     ``events`` are those of the columns with a row, used or not; there are so many ``lines``.
     """
@@ -105,6 +105,12 @@ class PeriodSums(NamedTuple):
     freedom: np.int64
     events: np.int64
     lines: np.int64
+
+
+class PeriodSums(NamedTuple):
+    """Sums over the line of a period, and counts of columns."""
+
+    line: LineSums
     too_few_events: np.int64
     ambiguous: np.int64
     two_returns: np.int64
@@ -274,7 +280,7 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
 @kernel(_nrt=False)
 def _pooled(out, estimator):
-    """Return the pooled squares of the rows used, their degrees of freedom, events and columns.
+    """Return the sums over the rows used.
 
     Lines that are cut, and full columns with background, do not have the width of a line.
     """
@@ -290,7 +296,7 @@ def _pooled(out, estimator):
                 freedom += used
                 events += out.windows.column_events[k, c] if k == 0 else 0
                 lines += k == 0
-    return squares, freedom, events, lines
+    return LineSums(squares, freedom, events, lines)
 
 
 @entry_kernel(_nrt=False)
@@ -343,7 +349,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         found = searched.found
         if found.status == UNMODULATED:
             unmodulated += 1
-        events_unmodulated += n - searched.events
+        events_unmodulated += n - searched.column.events
         if found.status != FOUND:
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
@@ -356,11 +362,10 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         columns.events[c] = found.window.sums.events
         two += found.second
         window, other = _reported(estimator.returns, found)
-        left = _column(packed, columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
             _put((k, c), window, n, searched.uncertain, out)
             _refine(
-                left, (k, c), window, line_variance, estimator, footprint, row_counts,
+                searched.column, (k, c), window, line_variance, estimator, footprint, row_counts,
                 out.windows,
             )  # fmt: skip
             refined = True
@@ -368,7 +373,5 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             window, other = other, window
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)
-    squares, freedom, events, lines = _pooled(out, estimator)
-    return PeriodSums(
-        squares, freedom, events, lines, few, ambiguous, two, unmodulated, events_unmodulated
-    )
+    line = _pooled(out, estimator)
+    return PeriodSums(line, few, ambiguous, two, unmodulated, events_unmodulated)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blinking import (
     _is_in_phase,
@@ -20,6 +18,7 @@ from eschorty_ros.core.line.window import (
     FOUND,
     TOO_FEW,
     UNMODULATED,
+    Column,
     Returns,
     _densest_window,
     _exceeds_background,
@@ -37,10 +36,10 @@ _UNCHANGED = 0.85
 
 
 class _ColumnReturns(NamedTuple):
-    """Returns of a column and its events that follow the laser; ``uncertain`` ones may not."""
+    """Returns of a column of the events that follow the laser; ``uncertain`` ones may not."""
 
     found: Returns
-    events: np.int64
+    column: Column
     uncertain: bool
 
 
@@ -66,10 +65,9 @@ def _search(column, half, estimator):
 
 @kernel(_nrt=False)
 def _modulated(column, found, half, estimator, blink, row_counts):
-    """Return the window of events that follow the laser, and the column without other windows.
+    """Return the window of events that follow the laser, of the column without other windows.
 
-    The last value is true when the window may be background all the same. The status is
-    ``UNMODULATED`` when no window of the column follows it.
+    The status is ``UNMODULATED`` when no window of the column follows it.
     """
     events = column.events
     for _ in range(_WINDOWS_MAX):
@@ -79,7 +77,8 @@ def _modulated(column, found, half, estimator, blink, row_counts):
         if left.events == column.events:
             # A second window is a second chance for background.
             if test.follows and (test.sure or column.events == events):
-                return found, column, not test.sure or column.events < events
+                uncertain = not test.sure or column.events < events
+                return _ColumnReturns(found, column, uncertain)
             left = _without(column, window.first, window.last)
         column = left
         found = Returns(TOO_FEW, False, window, window)
@@ -87,7 +86,8 @@ def _modulated(column, found, half, estimator, blink, row_counts):
             found = _search(column, half, estimator)
         if found.status == TOO_FEW:
             break
-    return Returns(UNMODULATED, False, found.window, found.window), column, True
+    found = Returns(UNMODULATED, False, found.window, found.window)
+    return _ColumnReturns(found, column, True)
 
 
 @kernel(_nrt=False)
@@ -219,13 +219,15 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
             if not _laser_test(column, new.first, new.last, blink).follows:
                 columns.rivals[c] = -1
                 column = _without(column, new.first, new.last)
-            return _ColumnReturns(Returns(FOUND, False, window, window), column.events, False)
+            return _ColumnReturns(Returns(FOUND, False, window, window), column, False)
     in_phase = found.status == FOUND and _is_of_the_stream(column, found.window, blink)
     if testing and found.status != TOO_FEW and not in_phase:
-        found, column, uncertain = _modulated(column, found, half, estimator, blink, row_counts)
+        modulated = _modulated(column, found, half, estimator, blink, row_counts)
+        found, column = modulated.found, modulated.column
+        uncertain = modulated.uncertain
         if found.status == UNMODULATED:
             columns.rivals[c] = -1
-            return _ColumnReturns(found, column.events, True)
+            return modulated
     if estimator.returns != _STRONGEST:
         found = _all_returns(column, half, estimator, found)
         if testing and found.second:
@@ -240,4 +242,4 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
             found = _stronger(column, c, half, columns, estimator, blink, found)
         else:
             columns.rivals[c] = -1
-    return _ColumnReturns(found, column.events, uncertain)
+    return _ColumnReturns(found, column, uncertain)

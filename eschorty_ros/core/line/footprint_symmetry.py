@@ -6,7 +6,10 @@ from its row, in eighths of a row.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.pixel_locking import _WHOLE
@@ -32,14 +35,22 @@ _END_SHARE = 0.2
 _LOPSIDED_PX = 0.25
 
 
+class _Counts(NamedTuple):
+    """By place the number of pixels, the mean of their events and its variance for one pixel."""
+
+    pixels: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
 @kernel(_nrt=False)
-def _asymmetry(places, centre):
+def _asymmetry(counts, centre):
     """Return how different mean counts are on either side of a centre, over how much they vary.
 
     It is 0 for a symmetric footprint, 1 for an unrelated one, and infinite where few places are
     seen on both sides or counts vary no more there than by chance.
     """
-    pixels, mean, variance = places
+    pixels, mean, variance = counts.pixels, counts.mean, counts.variance
     reach = min(centre, pixels.size - 1 - centre)
     total, both = 0.0, 0
     for b in range(1, reach + 1):
@@ -67,7 +78,7 @@ def _near_places(values):
 
 @kernel
 def _mean_counts(pixels):
-    """Return by place the number of pixels, the mean of their events and its variance for one."""
+    """Return the counts by place of pixels by their events."""
     number, events, squares = np.zeros((3, pixels.shape[1]))
     for k in range(pixels.shape[0]):
         number += pixels[k]
@@ -78,7 +89,7 @@ def _mean_counts(pixels):
     mean = _near_places(events) / known
     # Counts that are all the same vary by less than a whole one.
     variance = _near_places(squares) / known - mean * mean + _WHOLE
-    return number / _NEAR_PLACES, mean, variance
+    return _Counts(number / _NEAR_PLACES, mean, variance)
 
 
 @kernel
@@ -89,15 +100,15 @@ def _centre(pixels):
     and no places beyond the sensor. The error is the distance to the furthest symmetric place. It
     is -1, and the centre the middle, where there are none or many.
     """
-    middle, places = pixels.shape[1] // 2, _mean_counts(pixels)
+    middle, counts = pixels.shape[1] // 2, _mean_counts(pixels)
     best, least, error = middle, _SYMMETRIC, -1
     tried = range(middle - _CENTRES, middle + _CENTRES + 1)
     for centre in tried:
-        asymmetry = _asymmetry(places, centre)
+        asymmetry = _asymmetry(counts, centre)
         if asymmetry < least:
             best, least, error = centre, asymmetry, 1
     for centre in tried:
-        if error > 0 and _asymmetry(places, centre) < _SYMMETRIC:
+        if error > 0 and _asymmetry(counts, centre) < _SYMMETRIC:
             error = max(error, abs(centre - best))
     return (best, error) if error <= _ERROR_MAX else (middle, -1)
 
@@ -105,7 +116,7 @@ def _centre(pixels):
 @kernel
 def _is_lopsided(pixels):
     """Return whether the mean of the counts by place is not in the middle of their ends."""
-    mean = _mean_counts(pixels)[1]
+    mean = _mean_counts(pixels).mean
     low = high = np.argmax(mean)
     least = _END_SHARE * mean[low]
     while low > 0 and mean[low - 1] > least:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,27 @@ class _Period(NamedTuple):
     remainder: int
     denominator: int
     every: int
+
+
+class EdgesAhead(NamedTuple):
+    """Edges that are certain, their indices and the time before which events can be assigned."""
+
+    edges_us: NDArray[np.int64]
+    indices: NDArray[np.int64]
+    safe_us: int
+
+
+class _Advance(NamedTuple):
+    """Numbers of new edges and used triggers, the time before which events can be assigned.
+
+    ``state`` and ``counts`` are those of the next call.
+    """
+
+    edges: int
+    triggers: int
+    safe_us: int
+    state: tuple[Any, ...]
+    counts: tuple[int, ...]
 
 
 class EdgeSchedule:
@@ -169,7 +190,7 @@ class EdgeSchedule:
         events, then call again.
         """
         # Plain tuples cross into compiled code faster than named ones.
-        n, used, self.safe_us, state, counts = _schedule(
+        new = _schedule(
             tuple(self._state),
             tuple(self._counts),
             self._parts,
@@ -178,17 +199,18 @@ class EdgeSchedule:
             self._edges_us,
             self._indices,
         )
-        self._state, self._counts = _State._make(state), _Counts._make(counts)
-        self._triggers_us = self._triggers_us[used:]
-        return self._edges_us[:n], self._indices[:n]
+        self.safe_us = new.safe_us
+        self._state, self._counts = _State._make(new.state), _Counts._make(new.counts)
+        self._triggers_us = self._triggers_us[new.triggers :]
+        return self._edges_us[: new.edges], self._indices[: new.edges]
 
-    def ahead(self, until_us: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    def ahead(self, until_us: int) -> EdgesAhead:
         """Return copies of what `advance` would return, and its ``safe_us``; nothing advances."""
         before = self._state, self._counts, self._triggers_us, self.safe_us
         edges_us, indices = (values.copy() for values in self.advance(until_us))
-        safe_us = self.safe_us
+        ahead = EdgesAhead(edges_us, indices, self.safe_us)
         self._state, self._counts, self._triggers_us, self.safe_us = before
-        return edges_us, indices, safe_us
+        return ahead
 
     def _edge_us(self, step: int) -> int:
         return self._state.anchor_us + round(step * self._period)
@@ -225,11 +247,7 @@ def _rounded(quotient, remainder, denominator):
 
 @entry_kernel
 def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indices):
-    """Write the edges that are certain once everything before the watermark is known.
-
-    Returns the number of edges, the number of triggers used, the time before which events can be
-    assigned, the new state and the new counts.
-    """
+    """Write the edges that are certain once everything before the watermark is known."""
     anchor_us, step, at_us, remainder, index, last_us, triggered, missed = state
     used, spurious, bridged, locks = counts
     tolerance_us = max((period.quotient_us + 1) // _TOLERANCE_SHARE, 1)
@@ -280,4 +298,4 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
             indices[n] = index
             n += 1
     state = anchor_us, step, at_us, remainder, index, last_us, triggered, missed
-    return n, taken, safe_us, state, (used, spurious, bridged, locks)
+    return _Advance(n, taken, safe_us, state, (used, spurious, bridged, locks))

@@ -264,11 +264,12 @@ def _adapted_half(half, sums, half_max):
     It exceeds the limit where most events of the columns are in the windows, hence the line's, or
     where these are filled evenly, hence too narrow, in most columns: background has few rows.
     """
-    if sums.freedom < _WIDTH_MIN_DOF:
+    line = sums.line
+    if line.freedom < _WIDTH_MIN_DOF:
         return half
-    measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
-    filled = measured > _FILLED * half and sums.lines > sums.too_few_events + sums.unmodulated
-    wider = 3 * sums.freedom > 2 * sums.events or filled
+    measured = HALF_PER_SIGMA * np.sqrt(line.squares / line.freedom)
+    filled = measured > _FILLED * half and line.lines > sums.too_few_events + sums.unmodulated
+    wider = 3 * line.freedom > 2 * line.events or filled
     limit = half_max * (_WIDER if wider else 1)
     return np.int64(min(max(np.rint(0.5 * (half + measured)), HALF_MIN), limit))
 
@@ -349,7 +350,7 @@ def _close(memory):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
-    if sums.unmodulated > sums.lines:
+    if sums.unmodulated > sums.line.lines:
         # The laser or the period's edge has started again.
         blink.lines[:] = 0.0
     _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,13 +119,25 @@ def _gap(value, per_level, noise, per_noise, sign):
     return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
 
 
+class _Start(NamedTuple):
+    """The two exponentials ``a`` and ``b`` where a summation begins, and its first step.
+
+    ``fade`` are their factors over the step, ``bend`` their second derivatives relative to
+    themselves, 1/us2.
+    """
+
+    a: float
+    b: float
+    step_us: float
+    fade_a: float
+    fade_b: float
+    bend_a: float
+    bend_b: float
+
+
 @kernel(inline="always")
 def _start(signal, noise, from_us):
-    """Return the begin of the summation and its first step.
-
-    These are the two exponentials at ``from_us``, the step and the factors of the exponentials over
-    it, and their second derivatives relative to themselves.
-    """
+    """Return the begin of a summation at ``from_us``."""
     settled, tau_us = signal.settled, signal.tau_us
     a, b, follower_us = _shares(signal)
     rate_a, rate_b = 1.0 / tau_us, 1.0 / follower_us
@@ -141,7 +154,7 @@ def _start(signal, noise, from_us):
     if not 0.0 < bend * from_us * from_us < room:
         step_us = min(math.sqrt(room / (bend + 1e-300)), 0.5 * tau_us)
         fade_a, fade_b = _decay(step_us * rate_a), _decay(step_us * rate_b)
-    return a, b, step_us, fade_a, fade_b, bend_a, bend_b
+    return _Start(a, b, step_us, fade_a, fade_b, bend_a, bend_b)
 
 
 @kernel(inline="always")
@@ -153,7 +166,9 @@ def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
     its side of ``middle``. Returns UNKNOWN when there is no passage up to ``until_us`` and the
     signal still moves: call again later. The steps do not depend on ``until_us``.
     """
-    a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(signal, noise, from_us)
+    start = _start(signal, noise, from_us)
+    a, b, step_us, fade_a, fade_b = start.a, start.b, start.step_us, start.fade_a, start.fade_b
+    bend_a, bend_b = start.bend_a, start.bend_b
     settled = signal.settled
     per_noise, per_on, per_off = 1.0 / noise, 1.0 / levels.on, 1.0 / levels.off
     value = settled + a + b

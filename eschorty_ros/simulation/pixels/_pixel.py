@@ -217,13 +217,20 @@ def _look_up(pixels, column, begin, end, model):
             pixel.t_next = t + after_us
 
 
+class _Due(NamedTuple):
+    """Rows [begin, end) of a column with something due, and the earliest time of it."""
+
+    begin: int
+    end: int
+    earliest_us: float
+
+
 @kernel
 def _rebias(pixels, column, t_us, before, after):
     """Anchor the pixels of a column at ``t_us``, up to which they have been run.
 
     ``before`` and ``after`` are the models; the pixels' thresholds are the new ones already. The
     next event is that of the new biases, and a refractory time under way keeps its length.
-    Returns the rows [begin, end) with something due and the earliest time of it.
     """
     reach = math.exp(GAP_MAX * after.noise)
     rows = pixels.shape[1]
@@ -244,4 +251,4 @@ def _rebias(pixels, column, t_us, before, after):
         if pixel.t_next < np.inf:
             begin, end = min(begin, row), row + 1
             earliest = min(earliest, pixel.t_next)
-    return min(begin, end), end, earliest
+    return _Due(min(begin, end), end, earliest)

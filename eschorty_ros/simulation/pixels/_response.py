@@ -39,16 +39,24 @@ class Levels(NamedTuple):
     off: float
 
 
+class _Shares(NamedTuple):
+    """The follower's two exponentials: ``a`` and ``b``, and the time constant of ``b``."""
+
+    a: float
+    b: float
+    follower_us: float
+
+
 @kernel
 def _shares(signal):
-    """Return ``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
+    """Return the follower's two exponentials."""
     u, y, settled, tau_us, follower_us = signal
     apart = 1.0 - follower_us / tau_us
     # Equal time constants have no such form; a difference of a part in a million suffices.
     if abs(apart) < 1e-6:
         apart, follower_us = 1e-6, tau_us * (1.0 - 1e-6)
     a = (u - settled) / apart
-    return a, y - settled - a, follower_us
+    return _Shares(a, y - settled - a, follower_us)
 
 
 @kernel

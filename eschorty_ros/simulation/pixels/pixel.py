@@ -414,8 +414,8 @@ def _run_columns(sensor, begin, until_us, model, out, n):
 def _rebias_columns(sensor, t_us, before, after):
     for column in range(sensor.columns.size):
         state = sensor.columns[column]
-        begin, end, due_us = _rebias(sensor.pixels, column, t_us, before, after)
-        state.due_begin, state.due_end, state.due_us = begin, end, due_us
+        due = _rebias(sensor.pixels, column, t_us, before, after)
+        state.due_begin, state.due_end, state.due_us = due.begin, due.end, due.earliest_us
 
 
 @entry_kernel
