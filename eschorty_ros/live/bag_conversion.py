@@ -35,7 +35,13 @@ from eschorty_ros.live.bag_files import (
     BagWriter,
     stamp,
 )
-from eschorty_ros.live.device_messages import MM_PER_M, laser_settings, ns_from_stamp, pulse_train
+from eschorty_ros.live.device_messages import (
+    MM_PER_M,
+    LaserSettings,
+    laser_settings,
+    ns_from_stamp,
+    pulse_train,
+)
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import Packet, check_span
 from eschorty_ros.live.recorded_packets import timed_packets
@@ -146,12 +152,13 @@ def _latched(source: BagReader, stream: PacketStream, kinds: tuple[str, ...]) ->
         if (message := next(iter(source.messages(kind)), None)) is None:
             continue
         if kind == LASER:
-            stream.set_laser(*_laser(source, message.fields)[:2])
+            laser = _laser(source, message.fields)
+            stream.set_laser(laser.modulation, laser.epoch_ns)
         else:
             _set(source, stream, kind, message.fields)
 
 
-def _laser(source: BagReader, fields: Any) -> tuple[Modulation, int | None, int | None]:
+def _laser(source: BagReader, fields: Any) -> LaserSettings:
     try:
         return laser_settings(fields)
     except ArgumentError as error:

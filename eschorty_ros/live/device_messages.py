@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from eschorty_ros.core.base.numbers import number
 from eschorty_ros.core.clocks import PulseTrain
@@ -18,20 +18,29 @@ def ns_from_stamp(time: Any) -> int:
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
 
 
-def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
-    """Return the modulation of a ``LaserState``, its epoch and since when the laser is on, ns.
+class LaserSettings(NamedTuple):
+    """Modulation of the laser, the ROS time of one rising edge and since when the laser is on.
 
-    The modulation is without ``on_edge_us``, which needs the camera's clock. The epoch is the ROS
-    time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown; the last
-    is ``None`` while the laser is off. Raises ``ArgumentError`` when frequency, duty or waveform
-    is out of range.
+    The modulation is without ``on_edge_us``, which needs the camera's clock. ``epoch_ns`` is
+    ``None`` while it is unknown, ``on_since_ns`` while the laser is off.
+    """
+
+    modulation: Modulation
+    epoch_ns: int | None
+    on_since_ns: int | None
+
+
+def laser_settings(state: Any) -> LaserSettings:
+    """Return the settings of a ``LaserState``; a ``phase_epoch`` of zero means unknown.
+
+    Raises ``ArgumentError`` when frequency, duty or waveform is out of range.
     """
     modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
     on = state.output == _OUTPUT_ON
-    return (
+    return LaserSettings(
         modulation,
-        ns_from_stamp(state.phase_epoch) or None,
-        ns_from_stamp(state.output_since) if on else None,
+        epoch_ns=ns_from_stamp(state.phase_epoch) or None,
+        on_since_ns=ns_from_stamp(state.output_since) if on else None,
     )
 
 

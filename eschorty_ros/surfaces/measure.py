@@ -190,14 +190,14 @@ def _distance(first: Part, other: Part, common_mm: float) -> Value:
     second = np.repeat([0.0, 1.0], [len(first.line), len(other.line)])
     middle = np.median(both.xyz[:, 1:], axis=0)
     design = np.column_stack([np.ones_like(second), second, both.xyz[:, 1:] - middle])
-    values, covariance, _, _ = solve(design, both)
-    step, slopes = values[1], values[2:]
+    fit = solve(design, both)
+    step, slopes = fit.values[1], fit.values[2:]
     cosine = 1.0 / math.sqrt(1.0 + slopes @ slopes)
     gradient = np.array([0.0, cosine, *(-step * slopes * cosine**3)])
     # The shared error of the slopes acts over the distance from one surface to the other.
     apart = np.median(other.xyz[:, 1:], axis=0) - np.median(first.xyz[:, 1:], axis=0)
     lever = apart / np.ptp(both.xyz[:, 1:], axis=0)
-    variance = float(gradient @ covariance @ gradient)
+    variance = float(gradient @ fit.covariance @ gradient)
     variance += (common_mm * cosine) ** 2 * (1.0 + float(lever @ lever))
     return Value(float(step) * cosine, math.sqrt(variance))
 

@@ -117,14 +117,24 @@ def fit_plane(part: Part, common_mm: float = 0.0) -> Plane:
     """
     middle = np.median(part.xyz[:, 1:], axis=0)
     design = np.column_stack([np.ones(len(part.line)), part.xyz[:, 1:] - middle])
-    values, covariance, residual, kept = solve(design, part)
+    fit = solve(design, part)
     extent = np.ptp(part.xyz[:, 1:], axis=0)
-    covariance += np.diag((common_mm / np.array([1.0, *extent])) ** 2)
-    return Plane(np.array([values[0], *middle]), values[1:], covariance, residual, kept)
+    covariance = fit.covariance + np.diag((common_mm / np.array([1.0, *extent])) ** 2)
+    centre = np.array([fit.values[0], *middle])
+    return Plane(centre, fit.values[1:], covariance, fit.residual, fit.kept)
 
 
-def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return values, covariance, residuals and kept points of a linear model of the range."""
+class Fit(NamedTuple):
+    """Values of a linear model with their covariance, and the residuals and use of its points."""
+
+    values: Array
+    covariance: Array
+    residual: Array
+    kept: NDArray[np.bool_]
+
+
+def solve(design: Array, part: Part) -> Fit:
+    """Return the weighted least-squares fit of a linear model of the range, outliers left out."""
     kept = np.ones(len(part.line), bool)
     for _ in range(_ITERATIONS):
         root = 1.0 / part.sigma[kept]
@@ -138,7 +148,7 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
         if np.array_equal(kept, before):
             break
     covariance = clustered_covariance(design[kept], residual[kept], part.select(kept))
-    return values, covariance, residual, kept
+    return Fit(values, covariance, residual, kept)
 
 
 def clustered_covariance(design: Array, residual: Array, part: Part) -> Array:

@@ -492,7 +492,8 @@ NOT_FOR_USERS = {
     "calibration.CalibrationFit", "calibration.Post", "evt3.BeginTime", "evt3.Counters",
     "evt3.EventArrays",
     "evt3.Events", "evt3.Triggers", "line.Centroids", "optics.DesignTable",
-    "optics.LaserClass", "reconstruction.Result", "storage.Recording", "storage.ScanLog",
+    "optics.LaserClass", "reconstruction.Result", "reconstruction.SensorWindow",
+    "storage.Recording", "storage.ScanLog",
     # Their arguments are objects of the package, or go to functions of the table.
     "calibration.AggregateFrame", "calibration.find_posts", "calibration.match_posts",
     "calibration.moving_target", "calibration.recorded_moving_target",

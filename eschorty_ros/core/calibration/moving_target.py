@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,14 @@ _OUTLIER_PX = 4.0
 _PAIRED_MAX = 300
 # The events of a moving line lag it by this much, with the opposite sign on the way back.
 _LATE_PX = 0.1
+
+
+class _Axis(NamedTuple):
+    """How a target's range depends on the stage position."""
+
+    range_at_zero_mm: float
+    sigma_at_zero_mm: float
+    range_per_stage: float
 
 
 def moving_target(
@@ -80,8 +89,8 @@ def moving_target(
     block = (profiles.column.astype(np.int64) - low) * blocks // (high - low + 1)
     _, period = np.unique(profiles.edge_us, return_inverse=True)
     group = period * blocks + block
-    at_zero_mm = range_at_zero_mm, sigma_at_zero_mm
-    return _measured(profiles, position, group, blocks, at_zero_mm, range_per_stage)
+    axis = _Axis(range_at_zero_mm, sigma_at_zero_mm, range_per_stage)
+    return _measured(profiles, position, group, blocks, axis)
 
 
 def _lit_columns(profiles: Profiles) -> tuple[int, int]:
@@ -98,8 +107,7 @@ def _measured(
     position: NDArray[np.float64],
     group: NDArray[np.int64],
     blocks: int,
-    at_zero_mm: tuple[float, float],
-    range_per_stage: float,
+    axis: _Axis,
 ) -> Targets:
     """Return a target for each group of points with enough columns that agree."""
     order = np.lexsort((profiles.row, group))
@@ -121,11 +129,10 @@ def _measured(
     variance = mean((row - np.repeat(centre, sizes)) ** 2)
     scatter = np.sqrt(np.maximum(variance, SIGMA_FLOOR_PX**2) / np.maximum(count, 1))
     at_mm = mean(position)[enough]
-    range_at_zero_mm, sigma_at_zero_mm = at_zero_mm
-    range_mm = range_at_zero_mm + range_per_stage * at_mm
+    range_mm = axis.range_at_zero_mm + axis.range_per_stage * at_mm
     if not (range_mm >= _NEAREST_MM).all():
         raise ArgumentError(
-            f"range_at_zero_mm is {range_at_zero_mm!r}: at a stage position of "
+            f"range_at_zero_mm is {axis.range_at_zero_mm!r}: at a stage position of "
             f"{at_mm[np.argmin(range_mm)]:g} mm the target would be at or behind the datum"
         )
     # The blocks of a profile have this part of their errors in common.
@@ -134,9 +141,9 @@ def _measured(
         row=centre[enough],
         range_mm=range_mm,
         sigma_row_px=np.hypot(scatter, common_px)[enough],
-        sigma_range_mm=_SIGMA_STAGE_MM * math.fabs(range_per_stage),
+        sigma_range_mm=_SIGMA_STAGE_MM * math.fabs(axis.range_per_stage),
         column=mean(column)[enough],
-        sigma_shared_mm=sigma_at_zero_mm,
+        sigma_shared_mm=axis.sigma_at_zero_mm,
         labels=[f"stage {mm:.3f} mm" for mm in at_mm.tolist()],
     )
     return targets.select(_following(targets.row, 1.0 / targets.range_mm))

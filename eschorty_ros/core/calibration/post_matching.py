@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -136,6 +137,17 @@ def _refuse_equal_ranges(known: Sequence[KnownTarget]) -> None:
             )
 
 
+class _Line(NamedTuple):
+    """Line ``row = slope / (R + b) + offset`` through pairs.
+
+    ``misfit`` is the mean squared share of their tolerance.
+    """
+
+    slope: float
+    offset: float
+    misfit: float
+
+
 class _LineSearch:
     """Lines ``row = slope / (R + b) + offset`` through two posts each, and the posts near them."""
 
@@ -155,7 +167,7 @@ class _LineSearch:
         self._allowed = np.array(
             [[_size_fits(post, target, nominal) for target in known] for post in posts], bool
         ).reshape(len(posts), len(known))
-        self._line: tuple[float, float] | None = None
+        self._line: _Line | None = None
 
     def best(self) -> list[tuple[int, int]]:
         """Return the pairs of the line that most posts agree with."""
@@ -165,7 +177,7 @@ class _LineSearch:
             if (first not in pairs) or (second not in pairs):
                 continue
             key = tuple(pairs)
-            found[key] = self._misfit(key)[0]
+            found[key] = self._fitted(key).misfit
         if not found:
             return []
         most = max(len(pairs) for pairs in found)
@@ -176,15 +188,14 @@ class _LineSearch:
                 f"{most} posts agree with the known ranges in more than one way; give sizes, "
                 "pixel hints, or posts at uneven distances"
             )
-        _, slope, offset = self._misfit(best)
-        self._line = slope, offset
+        self._line = self._fitted(best)
         return list(best)
 
     def row_of(self, target: KnownTarget) -> float:
         """Return the row of ``target`` in the principal column, NaN without a line."""
         if self._line is None:
             return math.nan
-        return self._line[0] / (target.range_mm + self._nominal.b_mm) + self._line[1]
+        return self._line.slope / (target.range_mm + self._nominal.b_mm) + self._line.offset
 
     def _lines(self) -> list[tuple[tuple[int, int], tuple[int, int], float, float]]:
         """Return every line through two pairs that is possible for a build near the nominal one."""
@@ -222,18 +233,15 @@ class _LineSearch:
                 pairs.append((i, j))
         return sorted(pairs)
 
-    def _misfit(self, pairs: Sequence[tuple[int, int]]) -> tuple[float, float, float]:
-        """Return the mean squared share of the tolerance about the pairs' own line, and the line.
-
-        The line is its slope and offset.
-        """
+    def _fitted(self, pairs: Sequence[tuple[int, int]]) -> _Line:
+        """Return the line that fits pairs best."""
         i, j = np.array(pairs).T
         centre = float(self._inverse[j].mean())
         at = self._inverse[j] - centre
         slope = float((at * self._row[i]).sum() / (at * at).sum())
         offset = float(self._row[i].mean()) - slope * centre
         residual = (self._row[i] - slope * self._inverse[j] - offset) / self._tolerance[i, j]
-        return float((residual**2).mean()), slope, offset
+        return _Line(slope, offset, float((residual**2).mean()))
 
 
 def _size_fits(post: Post, target: KnownTarget, nominal: RangeModel) -> bool:

@@ -14,6 +14,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -520,17 +521,18 @@ def _start_of(
     if not use.any():
         return _Timing(middle, float(end - begin), begin, end, agreeing, usual)
     floor_s = float(slack_s[use].min()) + 1e-9
-    after, late_s, after_s = _lower_end(latest_s[use], usual.after_s, floor_s)
+    after = _lower_end(latest_s[use], usual.after_s, floor_s)
     known = use & np.isfinite(earliest_s)
     if not known.any():
-        return _Timing(after, late_s, begin, end, agreeing, _Delays(usual.before_s, after_s))
-    before, early_s, before_s = _lower_end(-earliest_s[known], usual.before_s, floor_s)
-    weights = np.array([late_s**-2, early_s**-2])
-    joined = float(weights @ np.array([after, -before]) / weights.sum())
+        delays = _Delays(usual.before_s, after.delay_s)
+        return _Timing(after.end_s, after.error_s, begin, end, agreeing, delays)
+    before = _lower_end(-earliest_s[known], usual.before_s, floor_s)
+    weights = np.array([after.error_s**-2, before.error_s**-2])
+    joined = float(weights @ np.array([after.end_s, -before.end_s]) / weights.sum())
     low, high = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
     sigma_s = float(weights.sum() ** -0.5)
     start_s = min(max(joined, low), high)
-    delays = _Delays(before_s, after_s)
+    delays = _Delays(before.delay_s, after.delay_s)
     return _Timing(start_s, sigma_s, begin, end, agreeing, delays, bounded_below=True)
 
 
@@ -544,12 +546,20 @@ def _widest_agreement(low: Array, high: Array) -> tuple[float, float]:
     return float(ends[order][best]), float(ends[order][min(best + 1, ends.size - 1)])
 
 
-def _lower_end(values: Array, usual_s: float, floor_s: float) -> tuple[float, float, float]:
-    """Return the lower end of positive delays, its error, and the mean delay."""
+class _LowerEnd(NamedTuple):
+    """Lower end of positive delays, its error, and the mean delay."""
+
+    end_s: float
+    error_s: float
+    delay_s: float
+
+
+def _lower_end(values: Array, usual_s: float, floor_s: float) -> _LowerEnd:
+    """Return the lower end of times with positive delays."""
     least, count = float(values.min()), values.size
     mean_s = float(values.mean()) - least + usual_s / count
     correction = mean_s / count
-    return least - correction, max(correction, floor_s), mean_s
+    return _LowerEnd(least - correction, max(correction, floor_s), mean_s)
 
 
 def _fitted_shape(

@@ -17,7 +17,7 @@ from eschorty_ros.core.reconstruction.profiles import (
 )
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import without_modulation
-from eschorty_ros.core.reconstruction.region import region_window
+from eschorty_ros.core.reconstruction.region import SensorWindow, region_window
 from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
 from eschorty_ros.core.reconstruction.warm_up import warm_up
 
@@ -29,6 +29,7 @@ __all__ = [
     "Profiles",
     "Reconstructor",
     "Result",
+    "SensorWindow",
     "Settings",
     "add_stage",
     "live_points",

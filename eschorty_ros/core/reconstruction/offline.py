@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,6 +143,14 @@ def reconstruct_recording(
     )
 
 
+class _Joined(NamedTuple):
+    """All profiles and points of a recording, and the height map where it is made."""
+
+    profiles: Profiles
+    points: NDArray[np.void]
+    organized: NDArray[np.void] | None
+
+
 class _Cloud:
     """Profiles placed along the stage's travel, those outside the scan left out."""
 
@@ -190,7 +198,7 @@ class _Cloud:
         if self._keeps_profiles:
             self._profiles.append(profiles)
 
-    def joined(self) -> tuple[Profiles, NDArray[np.void], NDArray[np.void] | None]:
+    def joined(self) -> _Joined:
         """Return all profiles, points and the height map; free the parts while they are copied."""
         none = np.empty(
             0,
@@ -202,14 +210,14 @@ class _Cloud:
             organized = self._organized.joined(none.reshape(0, self._reconstructor.model.columns))
         parts, self._profiles = self._profiles, []
         if not parts:
-            return Profiles.empty(), points, organized
+            return _Joined(Profiles.empty(), points, organized)
         arrays: dict[str, Any] = {
             item.name: [getattr(profiles, item.name) for profiles in parts]
             for item in fields(Profiles)
         }
         parts.clear()
         profiles = Profiles(**{name: _joined(arrays.pop(name)) for name in list(arrays)})
-        return profiles, points, organized
+        return _Joined(profiles, points, organized)
 
 
 class _Array:

@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.line.columns import Columns
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.settings import Settings
+
+
+class SensorWindow(NamedTuple):
+    """A window of the sensor, pixels: its first column and row, its width and height."""
+
+    column: int
+    row: int
+    width: int
+    height: int
+
+
+class _Limits(NamedTuple):
+    """Which columns are ``lit``, and the first and last row of each."""
+
+    lit: NDArray[np.bool_]
+    first: NDArray[np.float64]
+    last: NDArray[np.float64]
 
 
 def region(columns: Columns, settings: Settings, model: RangeModel) -> Columns:
@@ -33,30 +52,29 @@ def rows_taken(settings: Settings, model: RangeModel) -> int:
     return round(float(np.median(rows[lit]))) if lit.any() else model.rows
 
 
-def region_window(settings: Settings, model: RangeModel) -> tuple[int, int, int, int]:
+def region_window(settings: Settings, model: RangeModel) -> SensorWindow:
     """Return the least window of the sensor that holds the region that ``settings`` give.
 
-    First column, first row, width and height in pixels; the full sensor for a region beside it.
+    It is the full sensor for a region beside it.
     """
     lit, first, last = _limits(settings, model)
     if not lit.any():
-        return 0, 0, model.columns, model.rows
+        return SensorWindow(0, 0, model.columns, model.rows)
     top, bottom = int(np.ceil(first[lit].min())), int(np.floor(last[lit].max()))
     left = int(np.argmax(lit))
-    return left, top, int(np.count_nonzero(lit)), bottom - top + 1
+    return SensorWindow(left, top, int(np.count_nonzero(lit)), bottom - top + 1)
 
 
-def _limits(
-    settings: Settings, model: RangeModel
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Return which columns are in the region, and the first and last row of each."""
+def _limits(settings: Settings, model: RangeModel) -> _Limits:
+    """Return the limits of the region that ``settings`` give."""
     number = np.arange(model.columns)
     first, last = np.zeros(model.columns), np.full(model.columns, model.rows - 1.0)
     for range_m, rows, side in ((settings.range_min, first, -1), (settings.range_max, last, 1)):
         if range_m > 0.0:
             row = model.row(range_m * 1e3, number) + side * settings.line_width_px
             rows[:] = np.where(np.isfinite(row), np.clip(row, 0.0, model.rows - 1.0), rows)
-    return (number >= settings.column_first) & (number <= settings.column_last), first, last
+    lit = (number >= settings.column_first) & (number <= settings.column_last)
+    return _Limits(lit, first, last)
 
 
 def within_ranges(range_mm: NDArray[np.float64], settings: Settings) -> NDArray[np.bool_]:

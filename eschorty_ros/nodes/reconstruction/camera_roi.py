@@ -10,13 +10,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.reconstruction import Settings, region_window
+from eschorty_ros.core.reconstruction import SensorWindow, Settings, region_window
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _PERIOD_S = 0.2
-
-Window = tuple[int, int, int, int]
 
 
 class CameraRoi:
@@ -32,23 +30,24 @@ class CameraRoi:
         self._client = node.create_client(
             SetParameters, "camera/set_parameters", callback_group=group
         )
-        self._wanted: Window | None = None
-        self._full: Window | None = None
-        self._set: Window | None = None
-        self._call: tuple[Window, RepeatedCall] | None = None
+        self._wanted: SensorWindow | None = None
+        self._full: SensorWindow | None = None
+        self._set: SensorWindow | None = None
+        self._call: tuple[SensorWindow, RepeatedCall] | None = None
         if follows:
             steady_timer(node, _PERIOD_S, self._step, group)
 
     def follow(self, settings: Settings, model: Any) -> None:
         """Follow the region of ``settings`` with the calibration's range model."""
-        self._wanted, self._full = region_window(settings, model), (0, 0, model.columns, model.rows)
+        self._wanted = region_window(settings, model)
+        self._full = SensorWindow(0, 0, model.columns, model.rows)
 
     def check_full(self) -> None:
         """Raise ``ArgumentError`` where the camera sees a part of its sensor only."""
-        if self._follows and self._wanted != self._full:
+        if self._follows and self._wanted is not None and self._wanted != self._full:
             raise ArgumentError(
-                f"camera_roi is 'follow' and leaves the window {self._wanted} of the sensor; "
-                "calibrate without limits of columns and ranges"
+                f"camera_roi is 'follow' and leaves the window {tuple(self._wanted)} of the "
+                "sensor; calibrate without limits of columns and ranges"
             )
 
     def _step(self) -> None:
@@ -64,5 +63,5 @@ class CameraRoi:
             result = call.result().results[0]
             if not result.successful:
                 self._node.get_logger().warning(
-                    f"camera_roi: the camera refuses roi {self._set}: {result.reason}"
+                    f"camera_roi: the camera refuses roi {tuple(self._set)}: {result.reason}"
                 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +104,19 @@ def _jumps(row: Array, reflectance: Array) -> NDArray[np.bool_]:
     return np.asarray((both & (far | bright)) | (lit[1:] != lit[:-1]))
 
 
+class _Edges(NamedTuple):
+    """Edges between two samples: distance ahead of the middle, and what is beyond in a column."""
+
+    ahead_mm: Array
+    row: Array
+    reflectance: Array
+    column: NDArray[np.int64]
+
+
 def _edges(
     scene: Scene, model: RangeModel, stage_mm: float, stretch: Array, columns: NDArray[np.int64]
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Return edges between two samples: mm ahead of the middle, row, reflectance, column.
+) -> _Edges:
+    """Return the edges of columns between two samples.
 
     Columns with a slope instead of an edge are left out.
     """
@@ -129,7 +139,7 @@ def _edges(
     sharp = (largest > 1.0) & (largest >= 0.5 * total)
     edge_mm = 0.5 * (stages[at] + stages[at + 1]) - stage_mm
     beyond = np.where(edge_mm > 0.0, at + 1, at)
-    return (
+    return _Edges(
         edge_mm[sharp],
         row[beyond, each][sharp],
         reflectance[beyond, each][sharp],

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import MotionPlan
@@ -18,6 +18,14 @@ Setting = TypeVar("Setting")
 
 SINE_STEPS = 12
 """Steps of constant light in which a sine rises, and in which it falls."""
+
+
+class _Flank(NamedTuple):
+    """Begin and end of a half-period, and whether the gate's signal is high in it."""
+
+    begin_us: int
+    end_us: int
+    high: bool
 
 
 @dataclass(frozen=True)
@@ -71,11 +79,11 @@ class Gate:
 
     def high(self, t_us: int) -> bool:
         """Return whether the gate's signal is high at ``t_us``: from rising to falling edge."""
-        return self._flank(t_us)[2]
+        return self._flank(t_us).high
 
     def flank_us(self, t_us: int) -> int:
         """Return the first edge of the gate's signal after ``t_us``."""
-        return self._flank(t_us)[1]
+        return self._flank(t_us).end_us
 
     def level(self, t_us: int) -> float:
         """Return the light at ``t_us``, 0 to 1."""
@@ -97,13 +105,13 @@ class Gate:
         step = (t_us - begin_us) * steps // length_us
         return begin_us - (-(step + 1) * length_us) // steps
 
-    def _flank(self, t_us: int) -> tuple[int, int, bool]:
-        """Return begin and end of the half-period of ``t_us``, and true when it is lit."""
+    def _flank(self, t_us: int) -> _Flank:
+        """Return the half-period of ``t_us``."""
         index = self.index(t_us)
         fall = self.fall_us(index)
         if t_us < fall:
-            return self.rise_us(index), fall, True
-        return fall, self.rise_us(index + 1), False
+            return _Flank(self.rise_us(index), fall, True)
+        return _Flank(fall, self.rise_us(index + 1), False)
 
 
 def _round_ratio(numerator: int, denominator: int) -> int:

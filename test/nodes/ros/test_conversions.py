@@ -92,10 +92,10 @@ def test_image_is_row_major():
 
 def test_laser_state_without_epoch_leaves_the_phase_unknown():
     state = LaserState(frequency=70.0, duty=0.5, waveform="square")
-    assert laser_settings(state)[1] is None
+    assert laser_settings(state).epoch_ns is None
     state.phase_epoch = stamp_from_ns(10**18 + 1)
-    modulation, epoch_ns, _ = laser_settings(state)
-    assert (modulation.frequency_hz, epoch_ns) == (70.0, 10**18 + 1)
+    laser = laser_settings(state)
+    assert (laser.modulation.frequency_hz, laser.epoch_ns) == (70.0, 10**18 + 1)
     with pytest.raises(ArgumentError, match="frequency_hz is 0"):
         laser_settings(LaserState(duty=0.5, waveform="square"))
 
