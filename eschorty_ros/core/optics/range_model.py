@@ -24,6 +24,21 @@ PIXELS_MAX = 1 << 16
 """Most pixels along one axis of any sensor."""
 
 
+def range_of_image_mm(image_px: Array, product_mm_px: float, b_mm: float) -> Array:
+    """Return the range, mm, where ``row + b'`` is ``image_px``; kernels compile it for numbers."""
+    return product_mm_px / image_px - b_mm
+
+
+def sigma_of_image_mm(image_px: Array, sigma_row: Array, product_mm_px: float) -> Array:
+    """Return the standard deviation of that range, mm; kernels compile it for numbers."""
+    return -product_mm_px / (image_px * image_px) * sigma_row
+
+
+def slope_of_column(column: Array, principal_column: float, slope_per_column: float) -> Array:
+    """Return the lateral offset per mm of depth, mm per mm; kernels compile it for numbers."""
+    return (column - principal_column) * slope_per_column
+
+
 def object_scale_mm(focal_mm: float, theta_deg: float) -> float:
     """Return ``k = f / sin(theta)`` in mm, unrounded (Eq. 1).
 
@@ -202,7 +217,8 @@ class RangeModel:
         ``row`` may be off the sensor; ``column`` is the principal one by default. They broadcast.
         NaN within 1 px of the pole and behind it (``row + b' > -1``).
         """
-        return np.asarray(self.product_mm_px / self._image_px(row, column) - self.b_mm)
+        image_px = self._image_px(row, column)
+        return np.asarray(range_of_image_mm(image_px, self.product_mm_px, self.b_mm))
 
     def row(self, range_mm: ArrayLike, column: ArrayLike | None = None) -> Array:
         """Return the row at which a range appears, px (Eq. 2); ``column`` as in :meth:`range_mm`.
@@ -239,12 +255,12 @@ class RangeModel:
         image, sigma = self._image_px(row, column), reals("sigma_row", sigma_row)
         broadcast("row and sigma_row", image, sigma)
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(-self.product_mm_px / (image * image) * sigma)
+            return np.asarray(sigma_of_image_mm(image, sigma, self.product_mm_px))
 
     def column_slope(self, column: ArrayLike) -> Array:
         """Return the lateral offset per mm of depth: ``(column - c0) p / k``, mm per mm."""
-        offset = reals("column", column) - self.principal_column
-        return np.asarray(offset * self.slope_per_column)
+        columns = reals("column", column)
+        return np.asarray(slope_of_column(columns, self.principal_column, self.slope_per_column))
 
     def lateral_mm(self, column: ArrayLike, range_mm: ArrayLike) -> Array:
         """Return the position along the laser line, mm, of a point at ``range_mm`` in ``column``.

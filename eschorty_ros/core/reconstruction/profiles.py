@@ -12,9 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import entry_kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
+from eschorty_ros.core.optics.range_model import (
+    range_of_image_mm,
+    sigma_of_image_mm,
+    slope_of_column,
+)
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
+
+_range_of_image_mm = kernel(inline="always")(range_of_image_mm)
+_sigma_of_image_mm = kernel(inline="always")(sigma_of_image_mm)
+_slope_of_column = kernel(inline="always")(slope_of_column)
 
 _DTYPES = {
     "period": np.int64,
@@ -111,14 +120,14 @@ def _scale(model: RangeModel) -> _Scale:
 
 @entry_kernel
 def _fill_ranges(row, sigma_row, column, scale, range_mm, sigma_mm):
-    """Set ranges and deviations as `RangeModel` has them, in one pass; return how many are NaN."""
+    """Set ranges and deviations in one pass; return how many are NaN."""
     beyond = 0
     for i in range(np.uintp(row.size)):
         image_px = row[i] + scale.offset_px[column[i]]
         known = image_px <= -POLE_MARGIN_PX
         image_px = image_px if known else np.nan
-        range_mm[i] = scale.product_mm_px / image_px - scale.b_mm
-        sigma_mm[i] = -scale.product_mm_px / (image_px * image_px) * sigma_row[i]
+        range_mm[i] = _range_of_image_mm(image_px, scale.product_mm_px, scale.b_mm)
+        sigma_mm[i] = _sigma_of_image_mm(image_px, sigma_row[i], scale.product_mm_px)
         beyond += not known
     return beyond
 
@@ -222,7 +231,9 @@ class _Lateral(NamedTuple):
 def _fill_link(measured, lateral, origin_us, points):
     """Set all fields of points in the moving frame but those of a reflectance."""
     for i in range(np.uintp(points.size)):
-        slope = (measured.column[i] - lateral.principal_column) * lateral.slope_per_column
+        slope = _slope_of_column(
+            measured.column[i], lateral.principal_column, lateral.slope_per_column
+        )
         depth_mm = measured.range_mm[i] + lateral.b_mm
         lateral_mm = slope * depth_mm if depth_mm > 0.0 else np.nan
         points[i].x = measured.range_mm[i] * 1e-3
