@@ -318,56 +318,64 @@ def _write(rows, smoothing, few, delay_us, state, output):
     state.rows = end
 
 
-@kernel(_nrt=False)
-def _close(memory):
-    """Turn the open period into rows."""
-    state, counters = memory.state, memory.counters
-    columns, estimator, gate = memory.columns, memory.estimator, memory.gate
-    blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
-    smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
+@kernel(_nrt=False, forceinline=True)
+def _gate_late(memory):
+    """Leave out the late events that are not the line's, where the phase of the light is gated."""
+    columns, gate, counters = memory.columns, memory.gate, memory.counters
     if gate.choices.size > 0:
-        if _learn_gate(columns, state.half, smoothing, gate):
-            _forget_usual(smoothing.widths, memory.bursts)
+        if _learn_gate(columns, memory.state.half, memory.smoothing, gate):
+            _forget_usual(memory.smoothing.widths, memory.bursts)
             # The events of another gate have another delay and another footprint.
             memory.delay.time_us = memory.delay.points = 0
-            _restart_from(footprint, memory.known)
+            _restart_from(memory.footprint, memory.known)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
-    learns, late = _learns(footprint), state.window >= memory.window_events
-    half = state.half
-    sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
-    state.half = _adapted_half(state.half, sums, estimator.half_max)
-    counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
+
+
+@kernel(_nrt=False, forceinline=True)
+def _count(sums, counters):
+    """Count a closed period and its columns."""
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
     counters.columns_ambiguous += sums.ambiguous
     counters.columns_two_returns += sums.two_returns
     counters.columns_unmodulated += sums.unmodulated
     counters.events_unmodulated += sums.events_unmodulated
-    counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter, smoothing)
-    counters.columns_smoothed += _smooth(rows, smoothing)
-    _scale_smoothed(rows, scatter, smoothing)
-    history = smoothing.widths.history
-    if sums.unmodulated > sums.line.lines:
-        # The laser or the period's edge has started again.
+
+
+@kernel(_nrt=False, forceinline=True)
+def _follow(memory, half, restarted):
+    """Add the period to the history of the line: its place, polarities and bursts.
+
+    ``restarted`` says that the laser or the period's edge has started again.
+    """
+    state, columns, blink = memory.state, memory.columns, memory.blink
+    history, place = memory.smoothing.widths.history, state.profiles % BLOCK_COLUMNS
+    if restarted:
         blink.lines[:] = 0.0
-    _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
-    _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)
+    _add_lines(columns, half, place, blink)
+    _compare_polarities(columns, half, place, history)
     if history.windowed:
         _compare_bursts(
-            columns, half, state.profiles, blink, history.step_px, rows.common2[0], memory.bursts,
-            history.shift_px,
+            columns, half, state.profiles, blink, history.step_px, memory.rows.common2[0],
+            memory.bursts, history.shift_px,
         )  # fmt: skip
     state.profiles += 1
-    _mark_unusual(rows, smoothing, memory.light.lit_share)
-    followed, shifted = _points_followed(history)
-    counters.points_followed += followed
-    counters.points_burst_shift += shifted
+
+
+@kernel(_nrt=False, forceinline=True)
+def _learn_line(memory, half, learns, late):
+    """Learn the footprint, the widths and the gate, and keep what later windows begin with.
+
+    ``half`` is the half width of the period's windows, ``late`` true in the last one of a window
+    of events.
+    """
+    state, counters, footprint = memory.state, memory.counters, memory.footprint
+    estimator, smoothing, rows = memory.estimator, memory.smoothing, memory.rows
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
-    if _choose(footprint, rows.row[0], history, late and enough, always):
+    if _choose(footprint, rows.row[0], smoothing.widths.history, late and enough, always):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
@@ -382,7 +390,33 @@ def _close(memory):
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)
-            _keep_gate(gate)
+            _keep_gate(memory.gate)
+
+
+@kernel(_nrt=False)
+def _close(memory):
+    """Turn the open period into rows."""
+    state, counters, estimator = memory.state, memory.counters, memory.estimator
+    scatter, smoothing, rows = memory.scatter, memory.smoothing, memory.rows
+    _gate_late(memory)
+    learns, late = _learns(memory.footprint), state.window >= memory.window_events
+    half = state.half
+    sums = _estimate_columns(
+        memory.columns, half, estimator, memory.blink, memory.footprint, rows, memory.row_counts
+    )
+    state.half = _adapted_half(half, sums, estimator.half_max)
+    counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
+    _count(sums, counters)
+    counters.columns_isolated += _reject_isolated(rows, smoothing)
+    _scale(rows, scatter, smoothing)
+    counters.columns_smoothed += _smooth(rows, smoothing)
+    _scale_smoothed(rows, scatter, smoothing)
+    _follow(memory, half, sums.unmodulated > sums.line.lines)
+    _mark_unusual(rows, smoothing, memory.light.lit_share)
+    followed, shifted = _points_followed(smoothing.widths.history)
+    counters.points_followed += followed
+    counters.points_burst_shift += shifted
+    _learn_line(memory, half, learns, late)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
