@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,21 +24,6 @@ from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 _range_of_image_mm = kernel(inline="always")(range_of_image_mm)
 _sigma_of_image_mm = kernel(inline="always")(sigma_of_image_mm)
 _slope_of_column = kernel(inline="always")(slope_of_column)
-
-_DTYPES = {
-    "period": np.int64,
-    "edge_us": np.int64,
-    "t_us": np.int64,
-    "column": np.uint16,
-    "row": np.float64,
-    "sigma_row": np.float64,
-    "events": np.uint32,
-    "width_px": np.float64,
-    "return_index": np.uint8,
-    "flags": np.uint16,
-    "range_mm": np.float64,
-    "sigma_mm": np.float64,
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -65,7 +50,7 @@ class LineRows:
     @cache
     def empty(cls) -> Self:
         """Return no rows."""
-        names = [item.name for item in fields(cls) if item.name in _DTYPES]
+        names = {item.name for item in fields(cls)} & _DTYPES.keys()
         return cls(**{name: np.empty(0, _DTYPES[name]) for name in names})
 
     @classmethod
@@ -180,6 +165,14 @@ class Profiles(LineRows):
         """Number of different profiles."""
         edge_us = self.edge_us
         return int(np.count_nonzero(edge_us[1:] != edge_us[:-1])) + 1 if len(self) else 0
+
+
+_DTYPES = {
+    name: get_args(get_args(hint)[1])[0]
+    for name, hint in get_type_hints(Profiles).items()
+    if get_origin(hint) is np.ndarray
+}
+"""Type of each array of `Profiles` but the optional ones."""
 
 
 def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
