@@ -77,51 +77,70 @@ class ProfileLength:
         1 where none follow the laser and these are the ``last``. Where too many do not, 1 if the
         phase is known, as they can be assigned; else they are dropped.
         """
+        periods = None
+        while periods is None:
+            periods = self._find_window(held, watermark_us, last)
+            if periods is None:
+                periods = self._of_blocks(held, watermark_us, last)
+        return periods
+
+    def _find_window(self, held: HeldEvents, watermark_us: int, last: bool) -> int | None:
+        """Find the estimation window that follows the laser or shows a line, and return ``None``.
+
+        Where there is none, return what `choose` does.
+        """
+        while self._window is None:
+            t, begin = held.arrays[0], self._seen
+            window = estimation_window(t[begin:], watermark_us, self._modulation)
+            if window is None and not last:
+                return 0
+            self._seen = end = t.size if window is None else begin + window.size
+            if self._edge_us(held, begin, end) is not None:
+                self._window = begin, end
+            elif window is None:
+                return 1
+            elif end > HELD_EVENTS_MAX:
+                if self._modulation.on_edge_us is not None:
+                    return 1
+                held.refuse(end)
+                self._seen = 0
+                if len(held) == 0:
+                    return 0
+        return None
+
+    def _of_blocks(self, held: HeldEvents, watermark_us: int, last: bool) -> int | None:
+        """Return the periods of a profile by the blocks behind the window, 0 before their end.
+
+        Where these have no light, forget the window and return ``None``.
+        """
+        assert self._window is not None
         t, period_us = held.arrays[0], self._modulation.period_us
-        while True:
-            while self._window is None:
-                begin = self._seen
-                window = estimation_window(t[begin:], watermark_us, self._modulation)
-                if window is None and not last:
-                    return 0
-                self._seen = end = t.size if window is None else begin + window.size
-                if self._edge_us(held, begin, end) is not None:
-                    self._window = begin, end
-                elif window is None:
-                    return 1
-                elif end > HELD_EVENTS_MAX:
-                    if self._modulation.on_edge_us is not None:
-                        return 1
-                    held.refuse(end)
-                    self._seen = 0
-                    if len(held) == 0:
-                        return 0
-                    t = held.arrays[0]
-            first, begin = self._window
-            end_us, periods = int(t[begin - 1]), 0
-            block: tuple[Array, NDArray[np.uint16], NDArray[np.uint16]] | None = None
-            if last and t[-1] < end_us + self._span_us:
-                # A short stream has no complete block.
-                begin = first
-            for enough in (EVENTS_WANTED, EVENTS_WANTED // 2):
-                end_us = self._block_end_us(t, begin, end_us, block is None)
-                if watermark_us <= end_us and not last:
-                    return 0
-                end = int(np.searchsorted(t, end_us))
-                edge_us = self._edge_us(held, begin, end)
-                if edge_us is not None and edge_us <= t[end - 1]:
-                    after = int(np.searchsorted(t, edge_us))
-                    t_us, columns, rows = (values[after:end] for values in held.arrays[:3])
-                    block = (t_us - edge_us) / period_us, columns, rows
-                if block is not None:
-                    periods = self._periods(*block, enough)
-                if periods == 1:
-                    return 1
-                begin = end
-            if periods > 0 or last:
-                return max(periods, 1)
-            # The light was on for less than a window.
-            self._seen, self._window = begin, None
+        first, begin = self._window
+        end_us, periods = int(t[begin - 1]), 0
+        block: tuple[Array, NDArray[np.uint16], NDArray[np.uint16]] | None = None
+        if last and t[-1] < end_us + self._span_us:
+            # A short stream has no complete block.
+            begin = first
+        for enough in (EVENTS_WANTED, EVENTS_WANTED // 2):
+            end_us = self._block_end_us(t, begin, end_us, block is None)
+            if watermark_us <= end_us and not last:
+                return 0
+            end = int(np.searchsorted(t, end_us))
+            edge_us = self._edge_us(held, begin, end)
+            if edge_us is not None and edge_us <= t[end - 1]:
+                after = int(np.searchsorted(t, edge_us))
+                t_us, columns, rows = (values[after:end] for values in held.arrays[:3])
+                block = (t_us - edge_us) / period_us, columns, rows
+            if block is not None:
+                periods = self._periods(*block, enough)
+            if periods == 1:
+                return 1
+            begin = end
+        if periods > 0 or last:
+            return max(periods, 1)
+        # The light was on for less than a window.
+        self._seen, self._window = begin, None
+        return None
 
     def _block_end_us(self, t_us: NDArray[np.int64], begin: int, begin_us: int, short: bool) -> int:
         """Return the end of the block that begins with an event and at a time."""
