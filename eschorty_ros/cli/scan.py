@@ -18,6 +18,7 @@ from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
 if TYPE_CHECKING:
     from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
+    from eschorty_ros.report.accuracy import KnownScene, Sweep
 
 
 @click.command("scan")
@@ -182,7 +183,7 @@ def _check(scene: str, calibration: str, effects: str) -> None:
 def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     """Write cloud and picture, print the table; DeviceError for a failed or empty scan."""
     from eschorty_ros.core.optics import load_calibration
-    from eschorty_ros.core.storage import TRUTH_FILE, load_recording, write_cloud, write_truth_csv
+    from eschorty_ros.core.storage import write_cloud
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation.scenes import names as scenes
     from eschorty_ros.simulation.world import Effects
@@ -194,39 +195,40 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         kept = f" ({len(result.points):,} points kept in {out / 'scan.pcd'})"
         raise DeviceError(result.message + (kept if len(result.points) else ""))
     calibration = load_calibration(job.calibration)
+    model, direction = calibration.model(), calibration.stage_direction
+    title = f"{job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, {job.calibration}"
     if job.hardware is not None:
-        title = f"{job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, {job.calibration}"
-        direction = calibration.stage_direction
-        figure = figures.scan_figure(result.points, None, title, direction)
-        figures.save(figure, out / "scan.png")
+        figures.save(figures.scan_figure(result.points, None, title, direction), out / "scan.png")
         _print(result, {}, out)
         return
-    truth = scenes.named(job.scene, calibration.model())
-    model, direction = calibration.model(), calibration.stage_direction
+    truth = scenes.named(job.scene, model)
     error_mm = accuracy.range_error_mm(result.points, truth, model, direction)
     sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, job.passes)
     seen = Effects.parse(job.effects).scene(truth, model)
     measured = accuracy.measure(result.points, seen, model, sweep, direction, error_mm)
-    title = (
-        f"{job.scene}: {job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, "
-        f"{job.calibration}; median |error| {measured.error_median_mm:.2f} mm"
-    )
+    title = f"{job.scene}: {title}; median |error| {measured.error_median_mm:.2f} mm"
     figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
     rows = accuracy_rows(measured) | {"seconds of sweep": f"{sweep.seconds:.2f}"}
     _print(result, rows, out)
     if result.recording:
-        try:
-            recording = load_recording(result.recording)
-        except EschortyError as error:
-            raise DeviceError(
-                f"the recording is not complete: {result.message or error}"
-            ) from error
-        try:
-            known = accuracy.recorded_truth(result.points, seen, recording, sweep)
-            columns = (known[name] for name in ("t_us", "column", "range_mm"))
-            write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
-        except EschortyError as error:
-            warn(f"the recording has no truth: {error}")
+        _write_truth(result, seen, sweep)
+
+
+def _write_truth(result: ScanResult, scene: KnownScene, sweep: Sweep) -> None:
+    """Write the scene's ranges to the scan's recording; DeviceError where that is not complete."""
+    from eschorty_ros.core.storage import TRUTH_FILE, load_recording, write_truth_csv
+    from eschorty_ros.report.accuracy import recorded_truth
+
+    try:
+        recording = load_recording(result.recording)
+    except EschortyError as error:
+        raise DeviceError(f"the recording is not complete: {result.message or error}") from error
+    try:
+        known = recorded_truth(result.points, scene, recording, sweep)
+        columns = (known[name] for name in ("t_us", "column", "range_mm"))
+        write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
+    except EschortyError as error:
+        warn(f"the recording has no truth: {error}")
 
 
 def _print(result: ScanResult, rows: dict[str, str], out: Path) -> None:
