@@ -37,7 +37,7 @@ class PacketPublisher:
         self.late_s = 0.0
         self.on = 0
         self.off = 0
-        self._decoder = Decoder(width, height)
+        self._decoder = Decoder()
         self._publisher = publisher
         self._width = self._height = 0
         self._frame_id = frame_id
@@ -70,6 +70,8 @@ class PacketPublisher:
 
     def begin(self, width: int, height: int, age_ns: int, size_bytes: int) -> None:
         """Publish a sensor of so many columns and rows in packets at this age or size."""
+        if (width, height) != (self._decoder.width, self._decoder.height):
+            self._decoder = Decoder(width, height)
         self._width, self._height = width, height
         self._packetizer = Packetizer(age_ns, size_bytes, self.dark)
 
