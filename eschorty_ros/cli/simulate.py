@@ -59,14 +59,18 @@ def command(
     from eschorty_ros.core.modulation import Modulation
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.simulation.pixels import preset
-    from eschorty_ros.simulation.scenes import named
+    from eschorty_ros.simulation.scenes import WithinRange, named
     from eschorty_ros.simulation.world import Effects, simulate_recording
 
     build = load_calibration(calibration)
+    shown = named(scene, build.model())
+    moved = {}
+    if isinstance(shown, WithinRange):
+        moved["ranges"] = f"{round(shown.offset_mm, 1) + 0.0} mm + {shown.factor:.5f} x the scene's"
     with ended_by_signals(), progress_bar("simulating") as report:
         recording = simulate_recording(
             out,
-            named(scene, build.model()),
+            shown,
             build,
             modulation=Modulation(frequency, duty),
             start_mm=start,
@@ -82,6 +86,7 @@ def command(
         str(out),
         {
             "events.raw": f"{recording.events_path.stat().st_size / 1e6:.1f} MB",
+            **moved,
             "stage": f"{start:g} to {stop:g} mm at {speed:g} mm/s",
             "truth": f"{0 if truth is None else len(truth):,} ranges",
         },

@@ -176,7 +176,8 @@ class InstrumentMonitor:
     def check_progress(self, timeout_s: float) -> None:
         """Raise ``ScanFailure`` when the reconstruction made no progress for ``timeout_s``."""
         if _age_s(self._advanced_s) > timeout_s:
-            raise ScanFailure(f"{self.cause_of_no_progress()} for {timeout_s:g} s")
+            cause, _, remedy = self.cause_of_no_progress().partition("; ")
+            raise ScanFailure(f"{cause} for {timeout_s:g} s" + (f"; {remedy}" if remedy else ""))
 
     def check_laser(self) -> None:
         """Raise ``ScanFailure`` when the laser does not report or is not on."""
@@ -190,8 +191,8 @@ class InstrumentMonitor:
         if _age_s(self._reconstruction_s) > _STALE_S:
             return "reconstruction: it does not report"
         if not self._camera_present():
-            return "camera: its node is gone; no events"
-        return "camera: no events reach the reconstruction"
+            return "camera: its node is gone, no events"
+        return "camera: no events reach the reconstruction; look at the logs of both nodes"
 
 
 def _age_s(at_s: float) -> float:

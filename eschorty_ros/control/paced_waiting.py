@@ -134,14 +134,19 @@ class PacedWaiting:
     def wait(
         self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
     ) -> None:
-        """Wait for ``condition``; raises ``ScanFailure`` with ``failure`` after ``timeout_s``."""
+        """Wait for ``condition``; raises ``ScanFailure`` with ``failure`` after ``timeout_s``.
+
+        A failure may have a remedy of its own behind a semicolon.
+        """
         begun_s = time.monotonic()
         try:
             while not condition():
                 waited_s = time.monotonic() - begun_s
                 text = failure if isinstance(failure, str) else failure()
                 if waited_s > timeout_s:
-                    raise ScanFailure(f"{text} within {timeout_s:.3g} s; check that the node runs")
+                    text, _, remedy = text.partition("; ")
+                    remedy = remedy or "check that the node runs"
+                    raise ScanFailure(f"{text} within {timeout_s:.3g} s; {remedy}")
                 self.waits_for = text if waited_s > _NOTED_S else ""
                 self.tick()
         finally:

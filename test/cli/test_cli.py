@@ -6,6 +6,7 @@ import gc
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -25,7 +26,8 @@ from eschorty_ros.cli import COMMANDS, INTERRUPTED, cluster, main
 from eschorty_ros.cli.console import progress_bar, table
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.reconstruction import Settings
-from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
+from eschorty_ros.core.storage import POINT_DTYPE, load_recording, read_cloud, write_cloud
+from eschorty_ros.simulation.scenes import Plane
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_ROS = """
@@ -518,3 +520,15 @@ def test_a_scheduler_that_does_not_answer_is_one_line(address, monkeypatch):
         next(cluster.on_cluster(address, print, [()]))
     # A client that is left would warn here.
     gc.collect()
+
+
+def test_simulate_prints_how_a_scene_is_moved_into_the_range_of_a_build(tmp_path):
+    near = tmp_path / "near.yaml"
+    good("design", "--focal-mm", "8", "--near-mm", "300", "--far-mm", "1000", "--out", near)
+    sweep = ("--start", "0", "--stop", "1", "--out", tmp_path / "rec")
+    said = good("simulate", "--scene", "plane", "--calibration", near, *sweep)
+    offset_mm, factor = re.search(r"ranges +(\S+) mm \+ (\S+) x", said).groups()
+    recording = load_recording(tmp_path / "rec")
+    scene_mm = Plane().range_mm(0.0, 0, recording.calibration.model())
+    expected_mm = float(offset_mm) + float(factor) * scene_mm
+    assert np.allclose(recording.truth["range_mm"], expected_mm, atol=0.1)

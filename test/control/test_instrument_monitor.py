@@ -94,3 +94,17 @@ def test_the_progress_is_where_the_stage_was_at_the_newest_event():
         subject.update_stage(t_ns, at_mm, 10.0, 0.0)
     subject.update_reconstruction(ReconstructionStatus(250, 0.0, 0, 0, ""), 0.0)
     assert subject.reconstructed_mm() == 2.0
+
+
+@pytest.mark.parametrize(
+    ("failure", "words"),
+    [
+        ("laser: no state", "laser: no state within 0 s; check that the node runs"),
+        ("laser: it is not active; activate it", "laser: it is not active within 0 s; activate it"),
+    ],
+)
+def test_a_wait_that_ends_in_vain_names_the_remedy(failure, words):
+    waiting = PacedWaiting("scanner", monitor(), lambda: 0, lambda: True, 3.0)
+    waiting.prepare(lambda: False, lambda phase: None)
+    with pytest.raises(ScanFailure, match=words):
+        waiting.wait(lambda: False, 0.0, failure)

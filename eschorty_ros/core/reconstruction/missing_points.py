@@ -48,7 +48,8 @@ def _gated(counts: Mapping[str, int], settings: Settings, modulation: Modulation
 
 
 def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int) -> str:
-    unmodulated, points = counts["columns_unmodulated"], counts["points"]
+    unmodulated = counts["columns_unmodulated"]
+    points = counts["points"] + counts["points_beyond_pole"]
     share = unmodulated / max(points + unmodulated, 1)
     # Background of dark columns, beside those of a line, has fewer events than these.
     line = counts["events_binned"] - counts["events_unmodulated"]

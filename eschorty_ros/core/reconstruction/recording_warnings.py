@@ -156,7 +156,8 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
         )
         return found
     after = position_mm[np.searchsorted(t_us, end_us + _LEFT_US) :]
-    if after.size and np.ptp(after) > least_mm:
+    ended = recording.scan is not None and recording.scan.reason
+    if after.size and np.ptp(after) > least_mm and not ended:
         found.append(
             f"the events end at {end_us * 1e-6:.3f} s, and the stage moves {np.ptp(after):.3g} mm "
             f"after that; where these were scanned, too, {name} is cut: copy it again"

@@ -46,7 +46,8 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
     if bridged > used > 0:
         found.append(
             f"the trigger input has an edge in {used} of {used + bridged} periods, which begin "
-            "profiles; where these edges are not the laser's, disconnect it"
+            "profiles; where these edges are not the laser's, set trigger_source to "
+            "what the input is wired to, or to none"
         )
     jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
     if jumps > 0:

@@ -25,6 +25,7 @@ from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import Recording, load_recording
 from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.live.bag_files import is_bag
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.live.recorded_packets import TimedPacket, timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
@@ -70,7 +71,10 @@ class ReplayNode(Node):
         self.parameters = Parameters(self, TABLE)
         if not self.parameters["recording"]:
             raise ArgumentError("parameter recording is empty; give a recording folder")
-        self._recording: Recording = load_recording(self.parameters["recording"])
+        path = Path(self.parameters["recording"])
+        if is_bag(path):
+            raise ArgumentError(f"{path} is a bag; eschorty convert makes a recording of it")
+        self._recording: Recording = load_recording(path)
         self._reader = RawReader(self._recording.events_path)
         self._events = self.create_publisher(
             EventPacket, "camera/events", qos.stream(qos.EVENT_DEPTH)

@@ -50,6 +50,7 @@ from eschorty_ros.srv import BeginScan, EndScan
 _TICK_LIMIT_S = 1.0
 # Part of the laser's reason when a heartbeat is missing.
 _HEARTBEAT = "/heartbeat"
+_NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
 _ASSEMBLE_S = 60.0
 # The reconstruction first works off the packets that a broken link has held back.
 _BEGIN_S = 20.0
@@ -160,7 +161,7 @@ class InstrumentClient(PacedWaiting):
         states = self._states.items()
         return [
             *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
-            *((state.active, f"{name}: its node is not active") for name, state in states),
+            *((state.active, f"{name}: {_NOT_ACTIVE}") for name, state in states),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
             (lambda: self.monitor.laser_reports, "laser: no state"),

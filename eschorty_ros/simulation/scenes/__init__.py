@@ -8,6 +8,7 @@ from eschorty_ros.simulation.scenes.names import NAMES, RECEDING_MM, Plane, Sphe
 from eschorty_ros.simulation.scenes.open3d_module import load_open3d
 from eschorty_ros.simulation.scenes.posts import Post, Posts, bench
 from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.simulation.scenes.within_range import WithinRange
 
 __all__ = [
     "EAR_OFF_MM",
@@ -24,6 +25,7 @@ __all__ = [
     "Scene",
     "Sphere",
     "Steps",
+    "WithinRange",
     "bench",
     "load_open3d",
     "measured_posts",

@@ -2,9 +2,12 @@
 
 from fractions import Fraction
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from line_events import encoded, line_events
+from reconstructing import reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
@@ -53,3 +56,11 @@ def test_values_outside_are_refused_with_the_choice(frequency_hz, waveform, choi
 
 def test_equal_settings_are_equal_and_usable_as_keys():
     assert {Modulation(70.0), Modulation(70.0, 0.5, "square")} == {Modulation(70.0)}
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int16])
+def test_numbers_of_numpy_are_taken(kind):
+    modulation = Modulation(kind(70), on_edge_us=np.int64(1000))
+    assert modulation == Modulation(70.0, on_edge_us=1000)
+    data = encoded(line_events(np.random.default_rng(1), lambda k, c: np.full(c.shape, 350.0)))
+    assert len(reconstruct(data, modulation)[0]) > 0

@@ -256,13 +256,18 @@ def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
         np.testing.assert_array_equal(points[name], expected[name], err_msg=name)
 
 
-def test_a_missing_recording_is_one_line(tmp_path):
-    parameters, domain = {"recording": tmp_path / "none"}, free_domain()
+@pytest.mark.parametrize(
+    ("name", "words"), [("none", "none"), ("bag", "is a bag; eschorty convert")]
+)
+def test_what_is_no_recording_is_one_line(tmp_path, name, words):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    parameters, domain = {"recording": tmp_path / name}, free_domain()
     with NodeProcess(NODES.format("replay"), parameters, domain=domain) as process:
         assert process.wait() == 1
         lines = [line for line in process.output.splitlines() if line.strip()]
         assert len(lines) == 1, process.output
-        assert "none" in lines[0]
+        assert words in lines[0]
 
 
 def test_scan_services_refuse_with_a_reason(live):
