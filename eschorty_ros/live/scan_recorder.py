@@ -234,7 +234,7 @@ class ScanRecorder:
             with self._noted():
                 newest = np.maximum.accumulate(samples["t_us"])
                 kept = np.diff(newest, prepend=np.iinfo(np.int64).min >> 1) > 0
-                if kept.any():
+                if np.count_nonzero(kept) > 1:
                     writer.replace_stage(samples[kept])
             with self._noted():
                 writer.end(self._log, points)

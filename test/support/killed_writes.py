@@ -146,7 +146,7 @@ def main_test(command, base):
             assert size in (before.get(name), after.get(name)), f"{what}: {name} has {size} bytes"
         if command == "simulate" and any(name.startswith("new/") for name in found):
             code, line = run("info", "new")
-            assert code == 0 or " is missing; add it" in line, f"{what}: {line}"
+            assert code == 0 or "missing from the recording" in line, f"{what}: {line}"
         again = in_a_child(arguments)
         refused = command == "simulate" and any(name.startswith("new/") for name in found)
         assert again[0] == int(refused), f"{what}, next run: {again}"

@@ -42,6 +42,14 @@ RAW_ALONE = (
 )
 """What to do with a file that is no recording."""
 
+_REMEDIES = {
+    EVENTS_FILE: "the camera's .raw",
+    STAGE_FILE: "es.write_stage_csv",
+    LASER_FILE: "es.write_laser_yaml; reconstruct --frequency stands in",
+    CALIBRATION_FILE: "es.save_calibration; reconstruct --calibration stands in",
+}
+"""What adds each file that a recording needs."""
+
 STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
 TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
 """One row per modulation period and lit column: the time is the middle of the lit phase."""
@@ -196,11 +204,7 @@ def load_recording(
     if not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; give a recording folder; {RAW_ALONE}")
     given = {CALIBRATION_FILE: calibration, LASER_FILE: frequency_hz}
-    for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
-        if given.get(name) is None and not (folder / name).is_file():
-            packed = (folder / f"{name}.gz").is_file()
-            remedy = f"run gunzip on {name}.gz" if packed else "add it to the recording"
-            raise FormatError(f"{folder / name} is missing; {remedy}")
+    _check_files(folder, {name for name, value in given.items() if value is not None})
     samples = read_stage_csv(folder / STAGE_FILE)
     scan = read_scan_yaml(folder / SCAN_FILE) if (folder / SCAN_FILE).exists() else None
     settings, marks = folder / SETTINGS_FILE, folder / MARKS_FILE
@@ -222,6 +226,20 @@ def load_recording(
         marks=read_marks_csv(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
     )
     return recording.corrected(calibration, frequency_hz)
+
+
+def _check_files(folder: Path, replaced: set[str]) -> None:
+    """Refuse a folder that lacks files, all of them named; those ``replaced`` may be missing."""
+    missing = []
+    for name, remedy in _REMEDIES.items():
+        if name not in replaced and not (folder / name).is_file():
+            packed = (folder / f"{name}.gz").is_file()
+            missing.append(f"{name} ({f'run gunzip on {name}.gz' if packed else remedy})")
+    if missing:
+        raise FormatError(
+            f"{folder}: missing from the recording {'is' if len(missing) == 1 else 'are'} "
+            f"{', '.join(missing)}; docs/python.md shows how to add them"
+        )
 
 
 def _track(samples: NDArray[np.void], scan: ScanLog | None) -> StageTrack:
@@ -272,7 +290,12 @@ def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
 
 
 def write_laser_yaml(path: str | os.PathLike[str], modulation: Modulation) -> None:
-    """Write ``laser.yaml`` at ``path``; an unknown ``on_edge_us`` is left out."""
+    """Write ``laser.yaml`` at ``path``; an unknown ``on_edge_us`` is left out.
+
+    Raises ``ArgumentError`` for what is no `Modulation`, or when the path cannot be written.
+    """
+    if not isinstance(modulation, Modulation):
+        raise ArgumentError(f"modulation is {short(modulation)}; give a Modulation")
     data: dict[str, Any] = {
         "frequency_hz": float(modulation.frequency_hz),
         "duty": float(modulation.duty),
@@ -298,7 +321,8 @@ def write_stage_csv(path: str | os.PathLike[str], t_us: ArrayLike, position_mm: 
     Raises
     ------
     ArgumentError
-        When the times do not increase, a position is not finite or the path cannot be written.
+        When there are fewer than two samples, the times do not increase, a position is not finite
+        or the path cannot be written.
 
     Examples
     --------
@@ -312,6 +336,8 @@ def write_stage_csv(path: str | os.PathLike[str], t_us: ArrayLike, position_mm: 
     <BLANKLINE>
     """
     samples = _columns(STAGE_DTYPE, t_us=t_us, position_mm=position_mm)
+    if len(samples) < 2:
+        raise ArgumentError(f"t_us and position_mm have {len(samples)} samples; give two or more")
     back = np.flatnonzero(np.diff(samples["t_us"]) <= 0)
     if back.size:
         raise ArgumentError(
@@ -370,14 +396,14 @@ def csv_lines(table: NDArray[np.void]) -> bytes:
 
 
 def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
-    """Read ``stage.csv``: STAGE_DTYPE, shape (n,), at least one sample, in time order.
+    """Read ``stage.csv``: STAGE_DTYPE, shape (n,), two samples or more, in time order.
 
     Raises ``FormatError`` in one line with the file, the line and the remedy.
     """
     path = file_path("path", path)
     samples = _read_csv(path, STAGE_DTYPE)
-    if len(samples) == 0:
-        raise FormatError(f"{path}: it has no samples; record at least one stage position")
+    if len(samples) < 2:
+        raise FormatError(f"{path}: stage samples: {len(samples)}; record two or more")
     times = samples["t_us"]
     back = np.flatnonzero(np.diff(times) <= 0)
     if back.size:

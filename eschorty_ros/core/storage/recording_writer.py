@@ -104,7 +104,7 @@ class RecordingWriter:
             self._stage_us = t_us
 
     def replace_stage(self, samples: NDArray[np.void]) -> None:
-        """Write all stage samples (STAGE_DTYPE) again, by a clock that is known better now."""
+        """Write two or more stage samples (STAGE_DTYPE) again, by a clock that is known better."""
         write_stage_csv(self.path / STAGE_FILE, samples["t_us"], samples["position_mm"])
 
     def end(self, scan: ScanLog, points: Points | None = None) -> None:

@@ -55,7 +55,7 @@ def test_given_values_stand_in_for_missing_files(folder):
     assert recording.calibration == load_calibration("config_1")
     assert recording.modulation == Modulation(300.0)
     (folder / "events.raw").rename(folder / "events.raw.gz")
-    with pytest.raises(FormatError, match="is missing; run gunzip on"):
+    with pytest.raises(FormatError, match=r"events.raw \(run gunzip on events.raw.gz\)"):
         load_recording(folder)
 
 
@@ -96,7 +96,7 @@ def test_empty_truth_is_an_empty_table(folder):
 
 
 @settings(derandomize=True, max_examples=60, deadline=None)
-@given(st.lists(st.floats(-1e5, 1e5), min_size=1, max_size=30))
+@given(st.lists(st.floats(-1e5, 1e5), min_size=2, max_size=30))
 def test_positions_through_text_and_through_ros_metres_are_identical(tmp_path_factory, positions):
     file = tmp_path_factory.mktemp("text") / "stage.csv"
     t_us = EPOCH_US + 10 * np.arange(len(positions))
@@ -160,13 +160,16 @@ def test_faults_survive_the_way_from_another_process():
             ["scan.yaml", "stage_gap_s is 1e+305"],
         ),
         (edit("scan.yaml", SCAN + "stage_gap_s: -5\n"), ["scan.yaml", "stage_gap_s is -5"]),
-        (remove("events.raw"), ["events.raw is missing", "add it"]),
-        (remove("stage.csv"), ["stage.csv is missing"]),
-        (remove("laser.yaml"), ["laser.yaml is missing"]),
-        (remove("calibration.yaml"), ["calibration.yaml is missing"]),
+        (remove("events.raw"), ["is events.raw (the camera's .raw)", "docs/python.md"]),
+        (
+            lambda folder: [(folder / f"{n}").unlink() for n in ("stage.csv", "laser.yaml")],
+            ["are stage.csv (es.write_stage_csv), laser.yaml (es.write_laser_yaml", "--frequency"],
+        ),
+        (remove("calibration.yaml"), ["calibration.yaml (es.save_calibration", "--calibration"]),
         (edit("stage.csv", "time,pos\n0,1\n"), ["line 1", "time,pos", "t_us,position_mm"]),
         (edit("stage.csv", "\n"), ["stage.csv line 1", "t_us,position_mm"]),
-        (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "no samples"]),
+        (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "samples: 0", "two or more"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n"), ["stage.csv", "samples: 1"]),
         (edit("stage.csv", "t_us,position_mm\n0,1\n\n5,2\n3,3\n"), ["line 5", "from 5 to 3"]),
         (edit("stage.csv", "t_us,position_mm\n5,2\n5,3\n"), ["line 3", "from 5 to 5"]),
         (edit("stage.csv", "t_us,position_mm\n0,1\n5,abc\n"), ["line 3", "position_mm is 'abc'"]),
@@ -227,4 +230,9 @@ def test_writers_refuse_what_readers_would(tmp_path):
         write_stage_csv(file, [5, 5], [1.0, 2.0])
     with pytest.raises(ArgumentError, match="one length"):
         write_stage_csv(file, [5, 6], [1.0])
+    for few in ([], [5]):
+        with pytest.raises(ArgumentError, match=f"{len(few)} samples; give two or more"):
+            write_stage_csv(file, few, few)
+    with pytest.raises(ArgumentError, match=r"modulation is 70\.0; give a Modulation"):
+        write_laser_yaml(file, 70.0)
     assert list(tmp_path.iterdir()) == []
