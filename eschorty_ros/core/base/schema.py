@@ -74,6 +74,8 @@ class Schema:
     infinity are refused.
     """
 
+    KIND = "record"  # without an annotation, or it would be a field
+
     def __post_init__(self) -> None:
         faults: list[Fault] = []
         kind: Any = type(self)
@@ -101,11 +103,16 @@ def validate(schema: type[Record], document: Document, error: type[EschortyError
 
     Raises ``error`` with one line for the first fault and the number of further ones.
     """
+    required = ", ".join(field.name for field in fields(schema) if field.default is MISSING)
     if not isinstance(document.data, dict):
-        required = [field.name for field in fields(schema) if field.default is MISSING]
         raise error(
-            f"{document.path}: it has {short(document.data)} instead of keys; "
-            f"write {', '.join(required)}"
+            f"{document.path}: it has {short(document.data)} instead of keys; write {required}"
+        )
+    strange = [key for key in document.data if not _near(schema, key)]
+    if 2 * len(strange) > len(document.data):
+        raise error(
+            f"{document.path}: it has {short(', '.join(strange))} and is no {schema.KIND}; give "
+            f"one with {required}"
         )
     faults: list[Fault] = []
     record: Record = _record(schema, document.data, (), faults)
@@ -127,13 +134,18 @@ def _hints(schema: Any) -> dict[str, Any]:
     return get_type_hints(schema, include_extras=True)
 
 
+def _near(schema: Any, key: str) -> list[str]:
+    """Return the schema's key that is most like ``key``, if one is like it."""
+    return get_close_matches(key, _hints(schema), n=1)
+
+
 def _record(schema: Any, data: dict[str, Any], keys: Keys, faults: list[Fault]) -> Any:
     """Return the record of ``data``; what is wrong is added to ``faults``."""
     hints, found = _hints(schema), len(faults)
     # An unknown key first: misspelt, it is also the reason why another one is missing.
     for key in data:
         if key not in hints:
-            near = get_close_matches(key, hints, n=1)
+            near = _near(schema, key)
             remedy = f"did you mean {near[0]}?" if near else "remove it"
             words = f" is {short(data[key])}, and no such key exists; {remedy}"
             faults.append(Fault((*keys, key), words))

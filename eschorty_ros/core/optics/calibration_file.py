@@ -70,6 +70,8 @@ class Calibration(Schema):
     that order and in their units, ``range_mm`` is the span of the targets.
     """
 
+    KIND = "calibration"
+
     name: str
     focal_length_mm: Positive
     f_number: Positive

@@ -63,6 +63,7 @@ _HALF_NM_MM = 0.5e-6
 
 @dataclass(frozen=True, kw_only=True)
 class _LaserFile(Schema):
+    KIND = LASER_FILE
     frequency_hz: float
     duty: float
     waveform: str
@@ -84,6 +85,8 @@ class ScanLog(Schema):
     ``reason``. A gap of the stage's samples longer than ``stage_gap_s`` is not bridged; 0 bridges
     any.
     """
+
+    KIND = "log of a scan"
 
     scan_id: str
     start_mm: float

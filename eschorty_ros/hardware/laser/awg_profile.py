@@ -119,6 +119,8 @@ class Burst(Schema):
 class AwgProfile(Schema):
     """One family of generators; the keys are those of ``config/awg_*.yaml``."""
 
+    KIND = "profile of a generator"
+
     name: Text
     model: str
     usb: UsbIds

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import parse_yaml
 from eschorty_ros.core.optics import RangeModel
@@ -54,7 +55,19 @@ class Effects(Schema):
         Raises ``ArgumentError`` for an unknown effect or a value outside its range.
         """
         yaml = "{}" if text == "none" else "{" + text.replace("=", ": ") + "}"
-        return validate(Effects, parse_yaml(yaml.encode(), "effects", ArgumentError), ArgumentError)
+        try:
+            document = parse_yaml(yaml.encode(), "effects", ArgumentError)
+        except ArgumentError:
+            raise ArgumentError(
+                f"effects is {short(text)}; write NAME=VALUE,... with each name once, or none"
+            ) from None
+        names = [field.name for field in fields(Effects)]
+        for name in document.data:
+            if name not in names:
+                raise ArgumentError(
+                    f"effects: there is none named {short(name)}; choose of {', '.join(names)}"
+                )
+        return validate(Effects, replace(document, lines={}), ArgumentError)
 
     def pixels(self, parameters: PixelParameters, model: RangeModel) -> PixelParameters:
         """Return the pixels under the ambient light, and with the line of the nearest range."""

@@ -175,6 +175,8 @@ def test_faults_name_file_key_value_and_remedy(tmp_path, change, parts):
         (b"\xff\xfe\x00", "not text"),
         (b"name: \x00\n", "correct the YAML"),
         (b"? [a, b]\n: 1\n", "line 1: a key is a list"),
+        (b"frequency_hz: 70\nduty: 0.5\n", "'frequency_hz, duty' and is no calibration; .* name,"),
+        (b"name: a\nusb: 1\nchannels: 2\n", "'usb, channels' and is no calibration"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_named(tmp_path, content, part):

@@ -146,14 +146,15 @@ def test_a_slow_readout_delays_the_rows_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("ambiant=1", "did you mean ambient"),
-        ("ambient=-1", "ambient is -1"),
+        ("foo=1", "effects: there is none named 'foo'; choose of ambient, .*, row_time_us$"),
+        ("ambient=-1", "effects: ambient is -1"),
         ("ambient=much", "ambient is 'much'; write a number"),
         ("falloff_mm=0", "falloff_mm"),
         ("ghost=0.4", "give the ghost a distance"),
         ("occlusion=2", "occlusion is 2"),
         ("row_time_us=0", "row_time_us"),
-        ("ambient=1}", "correct the YAML"),
+        ("ambient=1}", "effects is 'ambient=1}'; write NAME=VALUE,... with each name once"),
+        ("ambient=1,ambient=2", "each name once"),
     ],
 )
 def test_effects_that_cannot_be_are_refused(text: str, words: str) -> None:
