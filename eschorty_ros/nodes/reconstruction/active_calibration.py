@@ -10,7 +10,8 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.base.errors import CalibrationError, EschortyError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration import Targets, write_targets
 from eschorty_ros.core.optics import (
     Calibration,
@@ -108,15 +109,24 @@ class ActiveCalibration:
         return response
 
     def _load(self, name: str) -> Calibration:
-        if self._paths and os.sep in name:
+        if self._is_path(name):
             return load_calibration(name)
         return load_named_calibration(self.folder, name)
 
     def _save(self, calibration: Calibration, name: str) -> Path:
-        if self._paths and os.sep in name:
+        if self._is_path(name):
             save_calibration(calibration, name)
             return Path(name)
         return save_named_calibration(self.folder, calibration, name)
+
+    def _is_path(self, name: str) -> bool:
+        """Return whether ``name`` is a path; CalibrationError where the services take none."""
+        if os.sep in name and not self._paths:
+            raise CalibrationError(
+                f"{short(name)} is a path; give a name, or start the reconstruction with the "
+                "parameter calibration_paths true"
+            )
+        return os.sep in name
 
 
 def targets_path(calibration_path: Path) -> Path:

@@ -314,10 +314,10 @@ def test_only_calibrations_of_this_instrument_are_loaded(bench: CalibrationBench
         os.mkfifo(folder / "pipe.yaml")
         for name in ("pipe", "../made/other", "/dev/zero", "/etc/shadow", "x" * 5000, "missing"):
             answer = load(bench, name)
-            assert_not_done(answer)
+            assert_not_done(answer, *["calibration_paths"] * ("/" in name))
             assert len(answer.message) <= 300
         for name in ("pipe", "../other", str(folder / "kept"), "."):
-            assert_not_done(save(bench, name))
+            assert_not_done(save(bench, name), *["calibration_paths"] * ("/" in name))
         for file in ("other", "broken", "pipe"):
             (folder / f"{file}.yaml").unlink()
     active = bench.newest.id
