@@ -205,8 +205,8 @@ class ReplayNode(Node):
         )
         if self._lost != lost_before:
             raise DeviceError(
-                f"{self._lost - lost_before} packets were lost; make the reconstruction's "
-                "subscription of camera/events reliable"
+                f"{self._lost - lost_before} packets were lost; start the reconstruction with "
+                f"{self._reliable()}"
             )
 
     def _await_reconstruction(self) -> None:
@@ -225,14 +225,18 @@ class ReplayNode(Node):
             if end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
                 name = "a node" if end.node_name.startswith("_") else end.node_name
                 self.get_logger().warning(
-                    f"{name} subscribes to camera/events best effort and may lose packets; make "
-                    "its subscription reliable"
+                    f"{name} subscribes to {self._events.topic_name} best effort and may lose "
+                    f"packets; start it with {self._reliable()}"
                 )
         if self._calibration != (recorded := self._recording.calibration.name):
             self.get_logger().warning(
                 f"the recording is of {recorded} and reconstructed with {self._calibration}; check "
                 "that this is its instrument"
             )
+
+    def _reliable(self) -> str:
+        """Return the parameter that makes a node's subscription of the events reliable."""
+        return f"qos_overrides.{self._events.topic_name}.subscription.reliability:=reliable"
 
     def _publish_clock(self) -> None:
         reference = TimeReference(source="recording")

@@ -10,6 +10,7 @@ import recorded_scan
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
+from event_camera_msgs.msg import EventPacket
 from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import Image, PointCloud2
 from tf2_msgs.msg import TFMessage
@@ -219,12 +220,14 @@ def test_a_simulated_clock_that_stands_still_is_refused(live):
         assert "error: use_sim_time is true and /clock gives no time for 0.3 s" in process.output
 
 
-def test_another_calibration_than_the_recordings_is_a_warning(live, tmp_path):
+def test_another_calibration_and_best_effort_events_are_warnings(live, tmp_path):
+    live.observer.collect(EventPacket, "camera/events", qos.events())
     shutil.copytree(live.recording.path, tmp_path / "rec")
     other = dataclasses.replace(live.recording.calibration, name="other")
     save_calibration(other, tmp_path / "rec" / "calibration.yaml")
     output = replay(load_recording(tmp_path / "rec"), 0.0, live.observer.domain)
     assert "the recording is of other and reconstructed with config_3; check" in output
+    assert f"best effort and may lose packets; start it with {RELIABLE}:=reliable" in output
 
 
 def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
