@@ -107,13 +107,21 @@ def pairs(title: str, rows: dict[str, str]) -> None:
 
 def accuracy_rows(measured: Accuracy) -> dict[str, str]:
     """Return a cloud's errors as rows of a table."""
+    flagged = {"points with a flag": f"{measured.flagged:,}"}
+    if math.isnan(measured.error_median_mm):
+        return flagged | {"range error": "no point has a known range"}
+    good = "none"
+    if not math.isnan(measured.good_median_mm):
+        good = (
+            f"{measured.good_median_mm:.3f} mm, {measured.good_p95_mm:.3f} mm; "
+            f"{measured.good_within_1_sigma:.1%}, {measured.good_within_2_sigma:.1%}"
+        )
     return {
         "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
         "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole profiles",
         "median |range error|": f"{measured.error_median_mm:.3f} mm",
         "95th percentile": f"{measured.error_p95_mm:.3f} mm",
         "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, {measured.within_2_sigma:.1%}",
-        "points with a flag": f"{measured.flagged:,}",
-        "without them": f"{measured.good_median_mm:.3f} mm, {measured.good_p95_mm:.3f} mm; "
-        f"{measured.good_within_1_sigma:.1%}, {measured.good_within_2_sigma:.1%}",
+        **flagged,
+        "without them": good,
     }

@@ -135,7 +135,8 @@ def _print(measured: Measured, title: str) -> None:
         first.add_row(
             str(number), f"{len(surface.part.line):,}", f"{int((~plane.kept).sum()):,}",
             _text(surface.range_mm), _text(plane.slope(0)), _text(plane.slope(1)),
-            f"{plane.rms_mm:.2f}", _text(flat.value_mm), f"{flat.of_plane_mm:.2f}",
+            f"{plane.rms_mm:.2f}", _text(flat.value_mm),
+            f"{flat.of_plane_mm:.2f}" if math.isfinite(flat.of_plane_mm) else "-",
         )  # fmt: skip
     show(first)
     bent = [str(n) for n, surface in enumerate(measured.surfaces, 1) if surface.flat.of_no_plane]

@@ -277,6 +277,9 @@ def test_a_calibration_and_a_frequency_stand_in_for_the_recorded_ones(recording,
     assert np.median(np.abs(recorded["x"] - other["x"])) > 1e-3
     done = run("reconstruct", recording, "--out", out, "--frequency", 140)
     assert "given as 140 Hz and the events show 70 Hz; correct it" in done.stderr
+    none = good("reconstruct", recording, "--out", out, "--frequency", 1000)
+    assert "no point has a known range" in none
+    assert "nan" not in none
 
 
 def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):

@@ -149,6 +149,9 @@ def test_the_command_prints_values_with_their_sigma(tmp_path):
     facts = json.loads(CliRunner().invoke(main, [*arguments[:2], "--json"]).stdout)
     distance = facts["pairs"][0]["distance_mm"]
     assert abs(abs(distance["value"]) - 10.0) < 4.0 * distance["sigma"] < 1.0
+    # A region of few cells has no flatness.
+    narrow = CliRunner().invoke(main, [*arguments[:2], "--region", "20:25,:10"])
+    assert narrow.stdout.count(" - ") == 2
     # Nor is a surface with a fold of 1 mm a plane.
     write_cloud(tmp_path / "bent.ply", cloud(lambda y, z: 1300.0 + 0.1 * np.abs(y - y.mean())))
     bent = CliRunner().invoke(main, ["measure", str(tmp_path / "bent.ply")])
