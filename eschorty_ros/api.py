@@ -65,8 +65,8 @@ class Cloud:
 
 def reconstruct(
     recording: str | os.PathLike[str] | Recording,
-    progress: Callable[[int, int], Any] | None = None,
     *,
+    progress: Callable[[int, int], Any] | None = None,
     calibration: str | os.PathLike[str] | Calibration | None = None,
     frequency_hz: float | None = None,
     **settings: Any,

@@ -15,6 +15,8 @@ def test_settings_are_checked_and_an_empty_cloud_is_not_saved(tmp_path):
     simulate_recording(tmp_path, Plane(1300.0), narrow, stop_mm=12.0)
     with pytest.raises(es.EschortyError, match="no setting 'centre'"):
         es.reconstruct(tmp_path, centre="mean")
+    with pytest.raises(TypeError, match="1 positional argument"):
+        es.reconstruct(tmp_path, es.Settings())
     (tmp_path / "cloud.ply").write_text("the last good one")
     empty = es.reconstruct(tmp_path, events_min=1000)
     with pytest.raises(es.EschortyError, match="0 points"):
