@@ -149,9 +149,10 @@ def _truth(truth: NDArray[np.void] | None) -> dict[str, str]:
 def _cloud(path: Path) -> None:
     import numpy as np
 
-    from eschorty_ros.core.storage import finite_points, read_cloud
+    from eschorty_ros.core.storage import finite_points
+    from eschorty_ros.core.storage.cloud import stored_points
 
-    cloud = read_cloud(path, organized=True)
+    cloud = stored_points(path)
     points = finite_points(cloud)
     rows = {"points": f"{len(points):,}"}
     if cloud.ndim > 1:

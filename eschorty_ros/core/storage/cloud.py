@@ -108,8 +108,22 @@ def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Poin
     ArgumentError
         For an extension other than ``.pcd`` and ``.ply``.
     FormatError
-        When the file is missing, truncated, too long, or holds other fields.
+        When the file is missing, truncated, too long, or holds other fields; with ``organized``
+        also when it is no height map.
     """
+    points = stored_points(path)
+    if not organized:
+        return finite_points(points)
+    if points.ndim == 1:
+        raise FormatError(
+            f"{path}: its points are no height map; write it as .pcd of a reconstruction with the "
+            "setting organized, or read it without organized=True"
+        )
+    return points
+
+
+def stored_points(path: str | os.PathLike[str]) -> Points:
+    """Read a cloud as `read_cloud` does; a height map remains one, shape (profiles, columns)."""
     source = file_path("path", path)
     header = _header_writer(source)
     with open_regular_file(source, FormatError) as stream:
@@ -123,8 +137,7 @@ def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Poin
         if dtype is not None and found == expected:
             stream.seek(start)
             points = np.frombuffer(bytearray(stream.read(expected)), dtype, count).reshape(shape)
-            points = _widened(points, _UNFLAGGED.get(dtype, dtype))
-            return points if organized else finite_points(points)
+            return _widened(points, _UNFLAGGED.get(dtype, dtype))
     if dtype is None:
         raise OtherFormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "

@@ -106,6 +106,8 @@ def test_a_height_map_is_organised_in_pcd_and_its_points_read_everywhere(tmp_pat
     assert "WIDTH 40\nHEIGHT 9\n" in head
     assert "POINTS 360\n" in head
     assert read_cloud(tmp_path / "map.pcd", organized=True).tobytes() == made.tobytes()
+    with pytest.raises(FormatError, match=r"map.ply: its points are no height map; .*organized"):
+        read_cloud(tmp_path / "map.ply", organized=True)
     seen = np.asarray(open3d.io.read_point_cloud(str(tmp_path / "map.pcd")).points)
     np.testing.assert_array_equal(seen[np.isfinite(seen[:, 0])], coordinates(points))
 
