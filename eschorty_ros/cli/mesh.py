@@ -55,19 +55,19 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
     with progress_bar("meshing"):
         made = mesh(read_cloud(cloud), sigmas)
     write_mesh(target, made)
-    figures.save(mesh_figure(made, sigmas, cloud.name), target.with_suffix(".png"))
+    picture = target.with_suffix(".png")
+    figures.save(mesh_figure(made, sigmas, cloud.name), picture)
     if as_json:
         levels = [level._asdict() for level in made.levels]
         facts = {"mesh": str(target), "points": made.points, "chosen": made.chosen}
         click.echo(json.dumps({**facts, "levels": levels}))
     else:
-        _print(made, target)
+        _print(made, f"{target}, {picture}: {len(made.vertices):,} of {made.points:,} points")
 
 
-def _print(made: Mesh, target: Path) -> None:
+def _print(made: Mesh, title: str) -> None:
     rows = table(
-        f"{target}: {len(made.vertices):,} of {made.points:,} points",
-        "vertices", "kept", "triangles", "95 % within mm", "within sigmas", "",
+        title, "vertices", "kept", "triangles", "95 % within mm", "within sigmas", "",
     )  # fmt: skip
     for number, level in enumerate(made.levels):
         rows.add_row(

@@ -13,9 +13,6 @@ from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from eschorty_ros.surfaces.register import Pose
 
 
@@ -83,12 +80,13 @@ def command(
             poses.append(pose)
             sizes.append(len(part))
     write_cloud(out, joined)
-    figures.save(joined_figure(joined, sizes, str(out)), out.with_suffix(".png"))
+    picture = out.with_suffix(".png")
+    figures.save(joined_figure(joined, sizes, str(out)), picture)
     if as_json:
         facts = [_facts(path, pose) for path, pose in zip(clouds[1:], poses, strict=True)]
         click.echo(json.dumps({"cloud": str(out), "points": len(joined), "poses": facts}))
     else:
-        _print(clouds[1:], poses, joined, out)
+        _print(clouds[1:], poses, f"{out}, {picture}: {len(joined):,} points")
 
 
 def _facts(path: Path, pose: Pose) -> dict[str, Any]:
@@ -106,10 +104,8 @@ def _facts(path: Path, pose: Pose) -> dict[str, Any]:
     }
 
 
-def _print(
-    clouds: tuple[Path, ...], poses: list[Pose], joined: NDArray[np.void], out: Path
-) -> None:
-    rows = table(f"{out}: {len(joined):,} points", "cloud", "", "x", "y", "z", "pairs", "overlap")
+def _print(clouds: tuple[Path, ...], poses: list[Pose], title: str) -> None:
+    rows = table(title, "cloud", "", "x", "y", "z", "pairs", "overlap")
     for path, pose in zip(clouds, poses, strict=True):
         sigmas = pose.sigmas
         texts = [

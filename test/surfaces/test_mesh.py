@@ -71,6 +71,8 @@ def test_the_command_writes_a_mesh_that_open3d_reads(tmp_path, form):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         ["c.pcd", target.name, "m.png"]
     )
-    assert "written" in CliRunner().invoke(main, arguments).output
+    printed = "".join(CliRunner().invoke(main, arguments).stdout.split())
+    assert "written" in printed
+    assert f"{target},{tmp_path / 'm.png'}:" in printed
     bad = CliRunner().invoke(main, [*arguments[:3], str(tmp_path / "m.xyz")])
     assert (bad.exit_code, bad.stdout) == (1, "")
