@@ -149,7 +149,7 @@ def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
     def refuse(_path, **_):
         raise error
 
-    monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", refuse)
+    monkeypatch.setattr("eschorty_ros.core.storage.cloud.stored_points", refuse)
     result = run("info", cloud)
     assert_fails_in_one_line(result, "eschorty: cannot ")
     assert str(error.strerror) in result.stderr
@@ -175,7 +175,7 @@ def test_ctrl_c_is_exit_code_130(monkeypatch, cloud):
     def interrupt(_path, **_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", interrupt)
+    monkeypatch.setattr("eschorty_ros.core.storage.cloud.stored_points", interrupt)
     result = run("info", cloud)
     assert result.exit_code == INTERRUPTED
     assert "interrupted" in result.stderr
