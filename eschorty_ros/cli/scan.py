@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -206,7 +207,9 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, job.passes)
     seen = Effects.parse(job.effects).scene(truth, model)
     measured = accuracy.measure(result.points, seen, model, sweep, direction, error_mm)
-    title = f"{job.scene}: {title}; median |error| {measured.error_median_mm:.2f} mm"
+    title = f"{job.scene}: {title}"
+    if math.isfinite(measured.error_median_mm):
+        title += f"; median |error| {measured.error_median_mm:.2f} mm"
     figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
     rows = accuracy_rows(measured) | {"seconds of sweep": f"{sweep.seconds:.2f}"}
     _print(result, rows, out)

@@ -322,7 +322,8 @@ CALLS: dict[str, Call] = {
         stamp_ns=(0, integer(2**63)),
     ),
     "reconstruction.place": call(
-        partial(reconstruction.place, blank_profiles(N), MODEL),
+        partial(reconstruction.place, model=MODEL),
+        profiles=(blank_profiles(N), Kind([None, 3, "abc", np.zeros(N)])),
         stage_position_mm=(
             np.zeros(N),
             Kind(["abc", None, np.zeros(N + 1), np.zeros((2, 2))], [np.nan]),

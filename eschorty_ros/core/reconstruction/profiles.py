@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 from eschorty_ros.core.optics.range_model import (
     range_of_image_mm,
@@ -267,8 +268,11 @@ def place(
     Raises
     ------
     ArgumentError
-        When the positions do not match the points or the direction is not a unit vector.
+        When the positions do not match the points, the direction is not a unit vector, or the
+        profiles are none.
     """
+    if not isinstance(profiles, Profiles):
+        raise ArgumentError(f"profiles is {short(profiles)}; give the Profiles of a Reconstructor")
     position = _positions("stage_position_mm", stage_position_mm, len(profiles))
     known = np.isfinite(position)
     if not known.all():
