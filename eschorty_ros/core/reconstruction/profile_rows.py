@@ -318,7 +318,7 @@ def _write(rows, smoothing, few, delay_us, state, output):
     state.rows = end
 
 
-@kernel(_nrt=False, forceinline=True)
+@kernel(inline="always")
 def _gate_late(memory):
     """Leave out the late events that are not the line's, where the phase of the light is gated."""
     columns, gate, counters = memory.columns, memory.gate, memory.counters
@@ -333,7 +333,7 @@ def _gate_late(memory):
         counters.events_gated += gated
 
 
-@kernel(_nrt=False, forceinline=True)
+@kernel(inline="always")
 def _count(sums, counters):
     """Count a closed period and its columns."""
     counters.periods_closed += 1
@@ -344,7 +344,7 @@ def _count(sums, counters):
     counters.events_unmodulated += sums.events_unmodulated
 
 
-@kernel(_nrt=False, forceinline=True)
+@kernel(inline="always")
 def _follow(memory, half, restarted):
     """Add the period to the history of the line: its place, polarities and bursts.
 
@@ -364,7 +364,7 @@ def _follow(memory, half, restarted):
     state.profiles += 1
 
 
-@kernel(_nrt=False, forceinline=True)
+@kernel(inline="always")
 def _learn_line(memory, half, learns, late):
     """Learn the footprint, the widths and the gate, and keep what later windows begin with.
 
