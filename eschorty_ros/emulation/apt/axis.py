@@ -197,7 +197,7 @@ class Axis:
 
     def _follow(self, plan: MotionPlan) -> None:
         self._give_pulses(plan.start_ns)
-        while self._plans[0].end_ns < plan.start_ns - _HISTORY_NS:
+        while len(self._plans) > 1 and self._plans[1].start_ns < plan.start_ns - _HISTORY_NS:
             self._plans.popleft()
         self._plans.append(plan)
         self._on_plan(plan)

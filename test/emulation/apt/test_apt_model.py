@@ -74,6 +74,15 @@ def test_homing_and_a_move_follow_the_trapezoid() -> None:
     assert (plan.end_ns - plan.start_ns) * 1e-9 == pytest.approx(0.6, abs=1e-4)
 
 
+def test_a_move_after_minutes_at_rest() -> None:
+    host = Host()
+    host.ask(*ENABLE_AND_HOME, seconds=2.0)
+    host.now_ns += 600 * SECOND
+    (moved,) = host.ask(oracle.mot_move_absolute(UNIT, 1, 1, 50 * 20_000), seconds=2.0)
+    assert moved.msg == "mot_move_completed"
+    assert host.model.axis.position_mm(host.now_ns) == pytest.approx(50.0)
+
+
 class TriggeredHost(Host):
     """A homed host whose port 1 gives a sequence of position pulses in both directions."""
 
