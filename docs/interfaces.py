@@ -45,6 +45,7 @@ TOPICS = {
     "laser/heartbeat": "10 Hz while the sender wants light; the reconstruction when it calibrates",
     "laser/interlock": "true: open, laser off until closed by all that publish it and reset",
     "stage/odom": "position along the stage in `pose.pose.position.y`, speed in `twist`",
+    "stage/limits": "travel, speed and acceleration of its moves",
     "stage/trigger": "positions of the stage's pulses to the camera",
     "stage/heartbeat": "10 Hz while the stage is active",
     "profile": "one profile in `eschorty_link`; `profile_rate_max` at most",

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
-from eschorty_ros.control.scan_sequence import ScanFailure
+from eschorty_ros.control.scan_sequence import ScanFailure, StageLimits
 from eschorty_ros.control.stamp_ages import StampAges
 from eschorty_ros.hardware.base.protocols import LaserOutput
 
@@ -55,6 +55,7 @@ class InstrumentMonitor:
     - ``camera_present``: Returns whether a node publishes events.
 
     Public attributes:
+    - ``limits``: The stage's, ``None`` before they come.
     - ``samples``: ROS time (ns) and stage position (mm) since ``restart_samples``; none before.
     """
 
@@ -62,6 +63,7 @@ class InstrumentMonitor:
         self._camera_present = camera_present
         self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
         self._samples_from_ns = math.inf
+        self.limits: StageLimits | None = None
         self.laser: LaserReport | None = None
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = float("nan")

@@ -59,15 +59,21 @@ class ScanRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class ScanLimits:
-    """The stage's limits, its speed to the start, the longest wait for the last events.
-
-    Below ``completeness_min`` a scan fails.
-    """
+class StageLimits:
+    """Travel, speed and acceleration of the stage's moves."""
 
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
     acceleration_mm_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScanSettings:
+    """The speed to the start of a scan, and the longest wait for its last events.
+
+    Below ``completeness_min`` a scan fails.
+    """
+
     approach_mm_s: float
     drain_timeout_s: float
     completeness_min: float = 0.9
@@ -182,6 +188,9 @@ class Instrument(Protocol):
 class ScanInstrument(Instrument, Protocol):
     """Instrument for a scan, whose points the reconstruction collects."""
 
+    def stage_limits(self) -> StageLimits:
+        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
+
     def begin_scan(self, request: ScanRequest) -> None:
         """Start to collect points."""
 
@@ -189,7 +198,7 @@ class ScanInstrument(Instrument, Protocol):
         """Publish the points collected."""
 
 
-def check_request(request: ScanRequest, limits: ScanLimits, unit: str = "m") -> None:
+def check_request(request: ScanRequest, limits: StageLimits, unit: str = "m") -> None:
     """Raise ``ArgumentError`` with name, value and remedy unless the scan can be done.
 
     Lengths in messages are in ``unit``, ``m`` or ``mm``.
@@ -238,7 +247,7 @@ def check_laser(frequency_hz: float, duty: float) -> None:
         )
 
 
-def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, float]:
+def sweep_ends_mm(request: ScanRequest, limits: StageLimits) -> tuple[float, float]:
     """Return start and end of the sweep, within the travel.
 
     Speed is constant from start to stop if the travel leaves room for the run-up.
@@ -315,18 +324,22 @@ def end_light(instrument: Instrument, outcome: Outcome) -> None:
         outcome.attempt(instrument.stop_stage)
 
 
-def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
+def run_scan(
+    instrument: ScanInstrument, request: ScanRequest, settings: ScanSettings
+) -> ScanOutcome:
     """Do one scan; raise no ``EschortyError``, leave the laser off and the stage at rest."""
     outcome = ScanOutcome()
     collecting = False
-    begin_mm, end_mm = sweep_ends_mm(request, limits)
     try:
         with outcome.steps():
             instrument.report("preparing")
             instrument.check_nodes()
+            limits = instrument.stage_limits()
+            check_request(request, limits)
+            begin_mm, end_mm = sweep_ends_mm(request, limits)
             instrument.configure_laser(request.frequency_hz, request.duty)
             instrument.report("to_start")
-            instrument.move(begin_mm, limits.approach_mm_s)
+            instrument.move(begin_mm, min(settings.approach_mm_s, limits.speed_max_mm_s))
             instrument.begin_scan(request)
             collecting = True
             instrument.laser_on()
@@ -335,14 +348,14 @@ def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimit
             for number in range(request.passes):
                 instrument.move(begin_mm if number % 2 else end_mm, request.speed_mm_s)
     finally:
-        _finish(instrument, request, limits, outcome, collecting)
+        _finish(instrument, request, settings, outcome, collecting)
     return outcome
 
 
 def _finish(
     instrument: ScanInstrument,
     request: ScanRequest,
-    limits: ScanLimits,
+    settings: ScanSettings,
     outcome: ScanOutcome,
     collecting: bool,
 ) -> None:
@@ -353,7 +366,7 @@ def _finish(
     instrument.report("finishing")
     # After a failure the last events are kept, without a long wait for a camera that may be lost.
     failed = outcome.end is End.ABORTED
-    timeout_s = 1.0 if failed else limits.drain_timeout_s
+    timeout_s = 1.0 if failed else settings.drain_timeout_s
     within_s = _FAILED_DRAIN_S if failed else _DRAIN_S
     outcome.attempt(lambda: instrument.drain(timeout_s, within_s))
 
@@ -363,6 +376,6 @@ def _finish(
     outcome.attempt(end_scan)
     summary = outcome.summary
     if outcome.end is End.SUCCEEDED and not (
-        summary.points and summary.completeness >= limits.completeness_min
+        summary.points and summary.completeness >= settings.completeness_min
     ):
         outcome.end = End.ABORTED

@@ -4,14 +4,14 @@ import math
 from dataclasses import replace
 
 import pytest
-from recording_instrument import RecordingInstrument
+from recording_instrument import LIMITS, RecordingInstrument
 
 from eschorty_ros.control.scan_sequence import (
     End,
     ScanCanceled,
     ScanFailure,
-    ScanLimits,
     ScanRequest,
+    ScanSettings,
     ScanSummary,
     SweepProgress,
     check_request,
@@ -21,25 +21,40 @@ from eschorty_ros.control.scan_sequence import (
 )
 from eschorty_ros.core.base.errors import ArgumentError
 
-LIMITS = ScanLimits((0.0, 220.0), 250.0, 2000.0, 100.0, 10.0)
+SETTINGS = ScanSettings(100.0, 10.0)
 REQUEST = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
-STEPS = ("check_nodes", "configure_laser", "move", "begin_scan", "laser_on", "move")
+STEPS = ("check_nodes", "stage_limits", "configure_laser", "move", "begin_scan", "laser_on", "move")
 
 
 def test_order_of_a_scan():
     instrument = RecordingInstrument()
-    outcome = run_scan(instrument, REQUEST, LIMITS)
+    outcome = run_scan(instrument, REQUEST, SETTINGS)
     assert (outcome.end, outcome.message, outcome.summary.points) == (End.SUCCEEDED, "", 5)
     assert instrument.steps() == [*STEPS, "laser_off", "drain", "end_scan"]
+
+
+def test_a_scan_beyond_the_limits_that_the_stage_publishes_ends_before_it_moves():
+    short, slow = (replace(LIMITS, **change) for change in
+                   ({"travel_mm": (0.0, 30.0)}, {"speed_max_mm_s": 60.0}))  # fmt: skip
+    instrument = RecordingInstrument()
+    instrument.stage_limits = lambda: short
+    outcome = run_scan(instrument, REQUEST, SETTINGS)
+    assert outcome.end is End.ABORTED
+    assert outcome.message.startswith("stop is 0.04 m; choose 0 to 0.03 m")
+    assert not {"move", "laser_on"} & set(instrument.calls)
+    instrument, moves = RecordingInstrument(), []
+    instrument.stage_limits, instrument.move = lambda: slow, lambda *values: moves.append(values)
+    assert run_scan(instrument, REQUEST, SETTINGS).end is End.SUCCEEDED
+    assert [speed_mm_s for _, speed_mm_s in moves] == [60.0, 50.0]
 
 
 def test_passes_go_forth_and_back_under_one_light():
     instrument, moves = RecordingInstrument(), []
     request = replace(REQUEST, passes=3)
     instrument.move = lambda *values: moves.append(values)
-    assert run_scan(instrument, request, LIMITS).end is End.SUCCEEDED
+    assert run_scan(instrument, request, SETTINGS).end is End.SUCCEEDED
     begin, end = sweep_ends_mm(request, LIMITS)
-    assert moves == [(begin, LIMITS.approach_mm_s), (end, 50.0), (begin, 50.0), (end, 50.0)]
+    assert moves == [(begin, SETTINGS.approach_mm_s), (end, 50.0), (begin, 50.0), (end, 50.0)]
     assert instrument.calls.count("laser_on") == instrument.calls.count("end_scan") == 1
     progress = SweepProgress(replace(request, passes=2))
     shares = [progress.share("sweeping", at_mm) for at_mm in (18.0, 30.0, 41.0, 30.0, 18.0)]
@@ -71,7 +86,7 @@ def test_points_of_the_way_to_the_start_and_beyond_the_stop_are_not_counted():
 @pytest.mark.parametrize("error", [ScanFailure("stage: stuck"), ScanCanceled()])
 def test_every_interruption_ends_with_the_laser_off_and_at_rest(step, error):
     instrument = RecordingInstrument(step, error)
-    outcome = run_scan(instrument, REQUEST, LIMITS)
+    outcome = run_scan(instrument, REQUEST, SETTINGS)
     canceled = isinstance(error, ScanCanceled)
     assert outcome.end is (End.CANCELED if canceled else End.ABORTED)
     assert outcome.message == ("canceled" if canceled else "stage: stuck")
@@ -86,7 +101,7 @@ def test_every_interruption_ends_with_the_laser_off_and_at_rest(step, error):
 @pytest.mark.parametrize("step", ["laser_off", "drain", "end_scan"])
 def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
     instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
-    outcome = run_scan(instrument, REQUEST, LIMITS)
+    outcome = run_scan(instrument, REQUEST, SETTINGS)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
     steps = [name for name in instrument.steps() if name != "stop_stage"]
     assert steps[-3:] == ["laser_off", "drain", "end_scan"]
@@ -99,7 +114,7 @@ def test_the_first_reason_stays():
         raise ScanFailure("reconstruction: gone")
 
     instrument.end_scan = end_scan
-    assert run_scan(instrument, REQUEST, LIMITS).message == "camera: gone"
+    assert run_scan(instrument, REQUEST, SETTINGS).message == "camera: gone"
 
 
 @pytest.mark.parametrize(
@@ -121,7 +136,7 @@ def test_the_first_reason_stays():
 )
 def test_a_scan_without_its_points_is_no_success(summary, end, line):
     instrument = RecordingInstrument(summary=summary)
-    outcome = run_scan(instrument, REQUEST, LIMITS)
+    outcome = run_scan(instrument, REQUEST, SETTINGS)
     assert outcome.end is end
     assert outcome.summary.line == line
 

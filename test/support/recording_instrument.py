@@ -1,7 +1,9 @@
 """An instrument that records the steps of a sequence."""
 
 from eschorty_ros.control.calibration_sequence import run_capture
-from eschorty_ros.control.scan_sequence import ScanSummary
+from eschorty_ros.control.scan_sequence import ScanSummary, StageLimits
+
+LIMITS = StageLimits((0.0, 220.0), 250.0, 2000.0)
 
 
 class RecordingInstrument:
@@ -18,7 +20,7 @@ class RecordingInstrument:
             self.calls.append(name)
             if self._failing == (name, self.calls.count(name)):
                 raise self._error
-            return self._summary if name == "end_scan" else None
+            return {"end_scan": self._summary, "stage_limits": LIMITS}.get(name)
 
         return call
 

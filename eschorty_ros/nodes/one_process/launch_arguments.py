@@ -22,7 +22,7 @@ from eschorty_ros.nodes.reconstruction.auto_calibration import find_distances
 from eschorty_ros.nodes.ros.conversions import mm_from_m
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import Param
-from eschorty_ros.nodes.scanner.node import scan_limits
+from eschorty_ros.nodes.stage.parameters import stage_limits
 from eschorty_ros.simulation.scenes import named
 
 EVENTS = f"{NAMESPACE}/camera/events"
@@ -132,7 +132,7 @@ def scan(given: Mapping[str, str]) -> Description:
         start, stop, speed = (mm_from_m(sweep[name]) for name in ("start", "stop", "speed"))
         check_request(
             ScanRequest("", start, stop, speed, sweep["frequency"], sweep["duty"]),
-            scan_limits(sweep),
+            stage_limits(values["stage"]),
         )
     return _described(given, nodes, given["calibration"])
 

@@ -24,8 +24,7 @@ from eschorty_ros.nodes.one_process.composition import (
 )
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
-from eschorty_ros.nodes.scanner.node import TABLE as SCANNER_TABLE
-from eschorty_ros.nodes.scanner.node import scan_limits
+from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, stage_limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +75,9 @@ class ScanResult:
 
 
 def check_job(job: ScanJob) -> None:
-    """Raise ``ArgumentError``, in mm, unless stage and scanner can do the scan."""
-    given = (job.hardware or {}).get("scanner", {})
-    limits = scan_limits({param.name: param.default for param in SCANNER_TABLE} | given)
+    """Raise ``ArgumentError``, in mm, unless the scan is within the stage's parameters."""
+    given = (job.hardware or {}).get("stage", {})
+    limits = stage_limits({param.name: param.default for param in DRIVER_TABLE} | given)
     request = ScanRequest(
         "", job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, passes=job.passes
     )

@@ -27,12 +27,18 @@ from eschorty_ros.control.instrument_monitor import (
 )
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
-from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
+from eschorty_ros.control.scan_sequence import (
+    ScanFailure,
+    ScanRequest,
+    ScanSummary,
+    StageLimits,
+)
 from eschorty_ros.core.base.errors import one_line
-from eschorty_ros.core.base.numbers import number
+from eschorty_ros.core.base.numbers import number, positive
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.msg import StageLimits as StageLimitsMessage
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
 from eschorty_ros.nodes.ros.conversions import (
@@ -323,6 +329,13 @@ class ScanClient(InstrumentClient):
         "reconstruction/end_scan": EndScan,
     }
 
+    def stage_limits(self) -> StageLimits:
+        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
+        self.wait(lambda: self.monitor.limits is not None, self._service_timeout_s,
+                  "stage: no limits on stage/limits")  # fmt: skip
+        assert self.monitor.limits is not None
+        return self.monitor.limits
+
     def begin_scan(self, request: ScanRequest) -> None:
         """Start to collect points; a scan that is still open is ended and published first."""
         state = self.monitor.reconstruction
@@ -407,6 +420,14 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
             age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
+    def on_limits(message: StageLimitsMessage) -> None:
+        low, high = (number(name, getattr(message, name)) for name in ("travel_low", "travel_high"))
+        monitor.limits = StageLimits(
+            (mm_from_m(low), mm_from_m(high)),
+            mm_from_m(positive("speed_max", message.speed_max)),
+            mm_from_m(positive("acceleration", message.acceleration)),
+        )
+
     def on_heartbeat(message: Header, info: Mapping[str, Any]) -> None:
         worker.check(info)
         monitor.update_heartbeat(check_text("frame_id", message.frame_id))
@@ -417,6 +438,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         (LaserState, "laser/state", on_laser, qos.latched(qos.STATE_HISTORY)),
         (ReconstructionState, "reconstruction/state", on_reconstruction, 10),
         (Odometry, "stage/odom", on_stage, qos.stream()),
+        (StageLimitsMessage, "stage/limits", on_limits, qos.latched()),
         (Header, "reconstruction/heartbeat", on_heartbeat, qos.heartbeat()),
     ):
         node.create_subscription(kind, topic_name, callback, profile, callback_group=group)

@@ -6,7 +6,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,9 +19,9 @@ from eschorty_ros.control.scan_sequence import (
     SPEED_MIN_MM_S,
     End,
     ScanFailure,
-    ScanLimits,
     ScanOutcome,
     ScanRequest,
+    ScanSettings,
     SweepProgress,
     check_request,
     crossing_ns,
@@ -48,10 +48,6 @@ TABLE = (
           0.0, FREQUENCY_MAX_HZ),
     Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
     Param("passes", 1, "auto_scan: sweeps forth and back", "", 1, PASSES_MAX),
-    Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
-    Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
-    Param("speed_max", 0.25, "fastest scan", "m/s", _SPEED_MIN, 1.0),
-    Param("acceleration", 2.0, "acceleration of the stage, for the run-up", "m/s^2", 1e-3, 100.0),
     Param("approach_speed", 0.1, "speed towards the start", "m/s", _SPEED_MIN, 1.0),
     # Without `eschorty compile` the nodes of a first run answer later still.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
@@ -72,18 +68,6 @@ _CLIENT_TIMEOUT_S = 5.0
 _STARTING_S = 5.0
 
 
-def scan_limits(values: Mapping[str, Any]) -> ScanLimits:
-    """Return the limits in the node's parameters."""
-    return ScanLimits(
-        travel_mm=(mm_from_m(values["travel_min"]), mm_from_m(values["travel_max"])),
-        speed_max_mm_s=mm_from_m(values["speed_max"]),
-        acceleration_mm_s2=mm_from_m(values["acceleration"]),
-        approach_mm_s=mm_from_m(values["approach_speed"]),
-        drain_timeout_s=values["drain_timeout"],
-        completeness_min=values["completeness_min"],
-    )
-
-
 class ScannerNode(Node):
     """Runs one scan at a time.
 
@@ -94,7 +78,11 @@ class ScannerNode(Node):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("scanner", **kwargs)
         self.parameters = Parameters(self, TABLE)
-        self._limits = scan_limits(self.parameters)
+        self._settings = ScanSettings(
+            approach_mm_s=mm_from_m(self.parameters["approach_speed"]),
+            drain_timeout_s=self.parameters["drain_timeout"],
+            completeness_min=self.parameters["completeness_min"],
+        )
         self._client = ScanClient(
             self,
             self.parameters["node_timeout"],
@@ -143,7 +131,8 @@ class ScannerNode(Node):
         )
         try:
             # First: a goal that is refused must not hold up another one.
-            check_request(request, self._limits)
+            if (limits := self._client.monitor.limits) is not None:
+                check_request(request, limits)
         except EschortyError as error:
             return self._refuse(goal, str(error))
         if not self._one_scan.acquire(blocking=False):
@@ -159,7 +148,7 @@ class ScannerNode(Node):
         self._scans += 1
         self._client_seen_s = time.monotonic()
         self._client.prepare(partial(self._canceled, goal), self._feedback(goal, request))
-        outcome = run_scan(self._client, request, self._limits)
+        outcome = run_scan(self._client, request, self._settings)
         result = self._result(request, outcome)
         details = result.message.removeprefix(End.CANCELED.value).removeprefix("; ")
         self._last = f"{request.scan_id}: {outcome.end.value}" + (details and f": {details}")

@@ -11,6 +11,7 @@ from typing import Any
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from std_msgs.msg import Header
 
 from eschorty_ros.action import MoveStage
 from eschorty_ros.control.scan_sequence import SPEED_MIN_MM_S
@@ -19,7 +20,7 @@ from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.emulation.bench.folder import stage_port
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
-from eschorty_ros.msg import PositionTrigger
+from eschorty_ros.msg import PositionTrigger, StageLimits
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
@@ -46,7 +47,7 @@ TABLE = (
 
 
 class StageNode(DeviceNode):
-    """Action ``stage/move``; topics ``stage/odom`` and ``stage/trigger``.
+    """Action ``stage/move``; topics ``stage/odom``, ``stage/limits`` and ``stage/trigger``.
 
     Activate homes when needed. A goal that cannot be carried out (outside travel, too fast, not
     active, another motion under way) is accepted and aborted at once, because a rejection carries
@@ -65,6 +66,7 @@ class StageNode(DeviceNode):
         self._command_errors = 0.0
         self._published_ns, self._rested = 0, False
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(_ODOM_DEPTH))
+        self._limits = self.create_publisher(StageLimits, "stage/limits", qos.latched())
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
         self._move = ActionServer(
             self,
@@ -91,6 +93,7 @@ class StageNode(DeviceNode):
         )
         with self._lock:
             self._stage = stage
+        self._limits.publish(self._limits_message(stage))
         # Homing gives none.
         self._trigger.publish(self._trigger_message(None))
         self.get_logger().info(f"{stage.identity.model} {stage.identity.serial}")
@@ -256,10 +259,21 @@ class StageNode(DeviceNode):
             self._published_ns, self._rested = state.t_ns, not state.moving
             self._odom.publish(self._odometry(state))
 
+    def _header(self) -> Header:
+        return Header(frame_id=self.parameters["base_frame"], stamp=stamp_from_ns(self.now_ns()))
+
+    def _limits_message(self, stage: LinearStage) -> StageLimits:
+        low, high = (m_from_mm(end_mm) for end_mm in stage.travel_mm)
+        return StageLimits(
+            header=self._header(),
+            travel_low=low,
+            travel_high=high,
+            speed_max=m_from_mm(stage.speed_max_mm_s),
+            acceleration=m_from_mm(stage.acceleration_mm_s2),
+        )
+
     def _trigger_message(self, pulses: PulseTrain | None) -> PositionTrigger:
-        message = PositionTrigger()
-        message.header.frame_id = self.parameters["base_frame"]
-        message.header.stamp = stamp_from_ns(self.now_ns())
+        message = PositionTrigger(header=self._header())
         if pulses is not None:
             message.first = m_from_mm(pulses.first_mm)
             message.interval = m_from_mm(pulses.interval_mm)

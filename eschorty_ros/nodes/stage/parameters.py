@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from eschorty_ros.control.scan_sequence import StageLimits
 from eschorty_ros.hardware.base.protocols import LinearStage
 from eschorty_ros.hardware.stage.apt_setup import CONTROLLERS, AptSettings
 from eschorty_ros.hardware.stage.apt_stage import open_stage
@@ -32,14 +33,24 @@ DRIVER_TABLE = (
 )
 
 
+def stage_limits(parameters: Mapping[str, Any]) -> StageLimits:
+    """Return the caps on what the controller reports."""
+    return StageLimits(
+        travel_mm=(mm_from_m(parameters["travel_low"]), mm_from_m(parameters["travel_high"])),
+        speed_max_mm_s=mm_from_m(parameters["speed_max"]),
+        acceleration_mm_s2=mm_from_m(parameters["acceleration"]),
+    )
+
+
 def make_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
     """Open the stage with the node's parameters."""
+    caps = stage_limits(parameters)
     settings = AptSettings(
         controller=parameters["controller"],
         bay=parameters["bay"],
-        speed_max_mm_s=mm_from_m(parameters["speed_max"]),
-        acceleration_mm_s2=mm_from_m(parameters["acceleration"]),
-        travel_mm=(mm_from_m(parameters["travel_low"]), mm_from_m(parameters["travel_high"])),
+        speed_max_mm_s=caps.speed_max_mm_s,
+        acceleration_mm_s2=caps.acceleration_mm_s2,
+        travel_mm=caps.travel_mm,
         homing_mm_s=mm_from_m(parameters["homing_speed"]),
         poll_hz=parameters["poll_rate"],
         trigger_interval_mm=mm_from_m(parameters["trigger_interval"]),

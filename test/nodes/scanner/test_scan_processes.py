@@ -94,7 +94,7 @@ def test_bad_parameters_are_refused(bench):
         ("reconstruction", "stage_gap", "soon", "type"),
         ("reconstruction", "frequency", 5.0, "16"),
         ("reconstruction", "calibration", "config_1", "read"),
-        ("scanner", "speed_max", 1.0, "read"),
+        ("scanner", "approach_speed", 1.0, "read"),
         ("laser", "frequency", 1.0, "range"),
     ):
         accepted, reason = bench.observer.set_parameter(node, name, value)

@@ -11,7 +11,7 @@ from action_msgs.msg import GoalStatus
 from benches import bench_here
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import MoveStage
-from eschorty_ros.msg import PositionTrigger
+from eschorty_ros.msg import PositionTrigger, StageLimits
 from nav_msgs.msg import Odometry
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
 
@@ -79,6 +79,14 @@ def test_late_subscribers_receive_the_trigger(stage: Stage) -> None:
     wait_until(lambda: received, "the position trigger")
     assert received[0].interval == pytest.approx(0.002)
     assert received[0].count > 100
+
+
+def test_late_subscribers_receive_what_the_controller_reports_within_the_caps(stage: Stage) -> None:
+    received = stage.observer.collect(StageLimits, "stage/limits", qos.latched())
+    wait_until(lambda: received, "the limits")
+    limits = received[0]
+    assert (limits.travel_low, limits.travel_high) == (0.0, 0.22)
+    assert (limits.speed_max, limits.acceleration) == pytest.approx((0.25, 2.0), rel=1e-3)
 
 
 def test_move_arrives(stage: Stage) -> None:
