@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 from collections.abc import Iterable, Iterator
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from eschorty_ros.report.accuracy import Accuracy
 
 LINE_EVERY_S = 5.0
+_FILE_COLUMNS = 200
 LESS_THAN_ALL = 0.99
 
 
@@ -84,10 +86,8 @@ def show(made: Table) -> None:
     """Print a table to stdout."""
     from rich.console import Console
 
-    console = Console(file=sys.stdout)
-    if not sys.stdout.isatty():
-        console = Console(file=sys.stdout, width=110)
-    console.print(made)
+    free = not sys.stdout.isatty() and "COLUMNS" not in os.environ
+    Console(file=sys.stdout, width=_FILE_COLUMNS if free else None).print(made)
 
 
 def decimals(values: Iterable[float]) -> int:

@@ -52,8 +52,8 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
     target = out or cloud.with_name(f"{cloud.stem}_mesh.ply")
     check_format(target)
     check_writable(target)
-    with progress_bar("meshing"):
-        made = mesh(read_cloud(cloud), sigmas)
+    with progress_bar("meshing") as report:
+        made = mesh(read_cloud(cloud), sigmas, report)
     write_mesh(target, made)
     picture = target.with_suffix(".png")
     figures.save(mesh_figure(made, sigmas, cloud.name), picture)

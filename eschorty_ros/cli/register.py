@@ -73,9 +73,12 @@ def command(
     joined, poses, sizes = parts[0], [], [len(parts[0])]
     with progress_bar("registering") as report:
         for number, part in enumerate(parts[1:]):
-            report(number / (len(parts) - 1), clouds[number + 1].name)
+
+            def progress(share: float, _: str, number: int = number) -> None:
+                report((number + share) / (len(parts) - 1), clouds[number + 1].name)
+
             start = pose_matrix(starts[number]) if number < len(starts) else None
-            pose = register(joined, part, start, reach_mm)
+            pose = register(joined, part, start, reach_mm, progress)
             joined = join(joined, part, pose)
             poses.append(pose)
             sizes.append(len(part))

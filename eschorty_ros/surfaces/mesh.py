@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array, file_path, positive
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed
 
@@ -49,7 +51,7 @@ class Mesh(NamedTuple):
     """Points of the cloud that the finest mesh holds."""
 
 
-def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
+def mesh(points: NDArray[np.void], sigmas: float = 2.0, progress: Progress | None = None) -> Mesh:
     """Return the coarsest mesh from which 95 % of the points are within ``sigmas`` of their own.
 
     The finest mesh joins neighbours of the grid, at the median range of 5 by 5; none over a step
@@ -76,6 +78,7 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
         open3d.utility.Vector3dVector(smooth.xyz.reshape(-1, 3)[used]),
         open3d.utility.Vector3iVector(place[triangles].astype(np.int32)),
     )
+    finest = len(shape.triangles)
     levels = [_level(open3d, shape, *measured)]
     if levels[0].error_sigmas > sigmas:
         raise ArgumentError(
@@ -84,6 +87,9 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
         )
     chosen = shape
     while len(levels) < _LEVELS_MAX and levels[-1].triangles > _TRIANGLES_MIN:
+        if progress is not None:
+            halvings = [math.log2(finest / n) for n in (levels[-1].triangles, _TRIANGLES_MIN)]
+            progress(halvings[0] / halvings[1], f"{levels[-1].triangles:,} triangles")
         coarser = chosen.simplify_quadric_decimation(levels[-1].triangles // 2)
         if not 0 < len(coarser.triangles) < levels[-1].triangles:
             break

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array, positive
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import organise
@@ -107,6 +108,7 @@ def register(
     other: NDArray[np.void],
     start: Array | None = None,
     reach_mm: float = 10.0,
+    progress: Progress | None = None,
 ) -> Pose:
     """Return the pose of ``other`` in the frame of ``first``.
 
@@ -127,7 +129,9 @@ def register(
     surface = _surface(target)
     transform = _about(np.eye(4) if start is None else start, origin)
     reach = reach_mm
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
+        if progress is not None:
+            progress(number / _ROUNDS, "")
         for _ in range(_ITERATIONS):
             pairs = _paired(surface, source, transform, reach)
             scaled = pairs.design / pairs.sigma[:, None]
