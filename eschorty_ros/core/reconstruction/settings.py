@@ -54,9 +54,10 @@ class Settings:
     plane the median error is the same with and without), and the filter costs more than a third of
     the speed.
 
-    The phase gate is off by default, too: at edges of a surface it makes large errors larger. -1
-    learns it from the stream; 1000 us at 70 Hz and 600 us at 300 Hz keep the simulated sensor's
-    events. Windows that cover the period, above about 1 kHz, remove nothing.
+    The phase gate, learned by default, is used where it halves the square of the rows' error. At
+    edges of a surface any gate makes large errors larger. 1000 us at 70 Hz and 600 us at 300 Hz
+    keep the simulated sensor's events. Windows that cover the period, above about 1 kHz, remove
+    nothing.
 
     The compensation of reflectance steps is off by default, since it needs the stage's speed and
     delays profiles by the time that a step takes to cross the line.
@@ -139,7 +140,11 @@ class Settings:
         "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"
     )
     footprint_sigma_px: float = _number(
-        4.1, 0.3, 60.0, "px", "standard deviation of the laser line's intensity over the rows"
+        4.1,
+        0.3,
+        60.0,
+        "px",
+        "standard deviation of the laser line's intensity over the rows, for reflectance",
     )
     white_width_px: float = _number(
         0.0,
