@@ -216,7 +216,7 @@ def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=12.0, help="length of the 70 Hz stream")
+    parser.add_argument("--seconds", type=float, default=12.0, help="length of the recording")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("docs/performance.md"))
     parser.add_argument("--recording", type=Path, help="reconstruct it and print the run")

@@ -56,7 +56,7 @@ THICKNESS_PX = 22.0
 BEND_MM, CONTRAST = 0.8, 1.15
 """Change of slope times distance, and of reflectance, that make an edge."""
 GATES_US = {"mean": 1000}
-"""Phase gate of the estimators that use every event of a column."""
+"""Phase gate by estimator; the others run without one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

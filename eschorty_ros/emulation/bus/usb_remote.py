@@ -26,7 +26,7 @@ from eschorty_ros.emulation.bus.usb_wire import (
 )
 
 _ANSWER_TIMEOUT_S = 20.0
-"""After this, a stopped or overloaded server counts as an unplugged device."""
+"""Beyond a transfer's own time-out; then the link is closed, as of an unplugged device."""
 
 
 _CLOCK_SET_NS = 10_000_000_000

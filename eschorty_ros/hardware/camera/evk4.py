@@ -34,9 +34,10 @@ class Evk4:
     """Event source over one EVK4; thread-safe.
 
     A failed transfer (a stall, an overflow) is cleared once and reported as a gap. The driver
-    reconnects after a second one in a row, after a time-out of both endpoints and after an
-    unplugged cable: it releases the camera, waits, searches for the same serial, initialises it,
-    writes its settings and streams. The stream then restarts (``EventChunk.restarted``).
+    reconnects after a second one in a row, when neither events nor answers come, when the camera
+    has stopped streaming by itself and after an unplugged cable: it releases the camera, waits,
+    searches for the same serial, initialises it, writes its settings and streams. The stream then
+    restarts (``EventChunk.restarted``).
 
     - ``clock_ns``: Clock of the arrival times.
     - ``serial``: Hex serial, ``""`` for the only camera. After a loss only the same camera is
@@ -45,7 +46,7 @@ class Evk4:
       to 8 s.
     - ``queue_bytes``: Bytes that may wait to be read; more is dropped, counted and reported as a
       gap.
-    - ``sleep``: Replaces waits of some seconds, for tests.
+    - ``sleep``: Replaces all waits, for tests.
     """
 
     width = WIDTH

@@ -1,4 +1,4 @@
-"""Temperature, illumination, packet period and trigger input of the sensor.
+"""Temperature, packet period and trigger input of the sensor, and the switch of its light meter.
 
 Source: openeb 5.1.1 ``imx636_tz_device.cpp``. Unconfirmed on hardware.
 """

@@ -149,8 +149,8 @@ class AwgLaser:
     def enable(self) -> None:
         """Read all settings back, switch on, read that back.
 
-        Raises ``DeviceError`` when not armed or configured, when a setting differs, and for a
-        failure; the output is off then.
+        Raises ``DeviceError`` when not armed or configured, which changes nothing, when a setting
+        differs and for a failure; after these two the output is off.
         """
         with self._command():
             if not self._armed:

@@ -1,8 +1,8 @@
 """The laser's guard: a process that owns the generator and outlives its owner.
 
-``GuardedLaser`` starts it in a session of its own, where it ignores the terminal's signals. It
-disables the output when the process that started it ends in any way, dumps core, is stopped, or
-sends no heartbeat for too long.
+``GuardedLaser`` or the ``service`` starts it in a session of its own, where it ignores the
+terminal's signals. It disables the output when its owner ends in any way, dumps core, is stopped,
+or sends no heartbeat for too long.
 """
 
 from __future__ import annotations
@@ -48,8 +48,7 @@ class Guard:
     beside the worker: the generator's driver lets ``disable`` overtake other commands. A third one
     renews light that ends by itself, as long as the watching thread has taken a turn recently.
 
-    - ``owner_pid``: Process to watch, the parent of this one; 0 for one that cannot be seen from
-      here.
+    - ``owner_pid``: Process to watch; 0 for one that cannot be seen from here.
     """
 
     def __init__(self, wire: Wire, owner_pid: int) -> None:

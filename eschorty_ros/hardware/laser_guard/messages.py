@@ -1,7 +1,7 @@
 """Messages between a guarded laser and its guard process.
 
-They are JSON objects, one per packet of a ``SOCK_SEQPACKET`` pair: the kernel keeps their bounds,
-sends each completely or not at all, and ends the stream when either process is gone.
+They are JSON objects, one per packet of a ``SOCK_SEQPACKET`` connection: the kernel keeps their
+bounds, sends each completely or not at all, and ends the stream when either process is gone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Message = dict[str, Any]
 
 
 class Wire:
-    """One end of the socket pair. Sending never waits; any thread may send."""
+    """One end of the connection. Sending never waits; any thread may send."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
