@@ -235,7 +235,6 @@ def main() -> None:
         seed=single.SEED,
         repeats=arguments.repeats,
         load=os.getloadavg()[0],
-        cores=cores,
     )
     text += header(ONE_THREAD)
     for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.4)):

@@ -78,12 +78,12 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "runs": runs_table(measured),
         },
         figures={"pareto": pareto_figure(summaries)},
-        captions=_captions(effort),
+        captions=_captions(),
         remarks=_remarks(summaries, precision),
     )
 
 
-def _captions(effort: Effort) -> dict[str, str]:
+def _captions() -> dict[str, str]:
     share = f"{100 * TYPICAL:g} %"
     runs = (
         f"{', '.join(SCENES)}; {FREQUENCY_HZ:g} Hz, {SPEED_MM_S:g} mm/s; background as a share of "

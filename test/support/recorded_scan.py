@@ -51,7 +51,6 @@ class LiveScan:
         self.pipeline = Pipeline(recording.calibration, SETTINGS, 0.0, 0.5, 6.0)
         self.pipeline.stream.announcement_expected = False
         self.modulation = Modulation(70.0)
-        rng = np.random.default_rng(SEED)
         self.packets = []
         rng, decoder, stamp_ns = np.random.default_rng(SEED), Decoder(64, 720), 0
         for seq, data in enumerate(RawReader(recording.events_path).chunks(PACKET_BYTES), 7):
