@@ -130,8 +130,9 @@ FLOOR_PYTHON ?= $(firstword $(wildcard /usr/bin/python3.11 /usr/bin/python3.12) 
 FLOOR := $(BUILD)/floor
 
 test-floor: $(FLOOR)/stamp
-	@NUMBA_CACHE_DIR=$(FLOOR)/numba PYTHONPATH="$(ROOT):$(ROOT)/experiments" \
-	  $(FLOOR)/bin/python -m pytest --numprocesses $(JOBS) $(addprefix test/,core live control simulation stability)
+	@export NUMBA_CACHE_DIR=$(FLOOR)/numba PYTHONPATH="$(ROOT):$(ROOT)/experiments"; \
+	$(FLOOR)/bin/python -c 'from eschorty_ros.cli import main; main(["compile"])'; \
+	$(FLOOR)/bin/python -m pytest --numprocesses $(JOBS) $(addprefix test/,core live control simulation stability)
 
 $(FLOOR)/stamp: requirements/floor.txt
 	@echo "Installing the oldest versions into $(FLOOR)"
