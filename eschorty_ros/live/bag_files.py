@@ -35,7 +35,7 @@ TOPICS = {
     CALIBRATION: "/eschorty/reconstruction/calibration",
     CLOCK: "/eschorty/camera/clock",
 }
-"""Message type and its topic; another topic is taken when it is the only one of the type."""
+"""Message type and its topic; another topic, but of a clock, is taken when it is the only one."""
 
 _HEADER = "std_msgs/Header header\n"
 DEFINITIONS = {

@@ -64,9 +64,10 @@ def render(template: str, **values: Any) -> str:
 
 
 def number(value: float | int | str) -> str:
-    """Return a value as text: text and integers as they are, else four digits or more.
+    """Return a value as text: text as it is, whole numbers with all digits, else four or more.
 
-    Large values keep two decimals; the CSV file has every digit.
+    Values from 100 on keep two decimals, from a million on four digits and an exponent; the CSV
+    file has every digit.
     """
     if isinstance(value, str):
         return value

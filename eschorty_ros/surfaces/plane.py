@@ -26,8 +26,8 @@ MAD = 1.4826
 CUT_SIGMA = 4.0
 _SURE_SIGMAS = 3.0
 _ITERATIONS = 20
-# Errors of columns closer than 17, which smoothing averages at most, and of lines closer than 4 are
-# alike; fewer than 4 strips show no scatter.
+# Errors of columns closer than 17, which smoothing averages at most by default, and of lines closer
+# than 4 are alike; fewer than 4 strips show no scatter.
 _STRIP_COLUMNS, _STRIP_LINES = 24, 6
 _STRIPS = 4, 16
 _FLAT_CELLS = 8

@@ -21,7 +21,7 @@ def ctz64(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def popcount64(typingctx: Any, value: Any) -> Any:
-    """Return number of set bits of a uint64."""
+    """Return the number of set bits of a uint64."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])

@@ -147,7 +147,7 @@ class Encoder:
             )
 
     def _high_words(self, start_us: int, end_us: int) -> int:
-        """Return number of TIME_HIGH words up to ``end_us``."""
+        """Return the number of TIME_HIGH words up to ``end_us``."""
         begun_us = start_us if self._state["t_us"] == _NONE else int(self._state["t_us"])
         if end_us - begun_us > _IDLE_MAX_US:
             raise ArgumentError(

@@ -54,11 +54,11 @@ _FOUND_MIN = 0.995
 class LearnedGate(NamedTuple):
     """The gate in use, and the choices for one to be learned.
 
-    All have the fields of a `PhaseGate`. The state is ``known`` once a choice is made, the first of
-    which is no gate, and has ``changed`` if that is another than before; its ``late`` is the usual
-    number of late events of a column, ``half`` the half width of the windows of rows in which it is
-    chosen, 0 before, and ``moving`` the displacement of the line then. Windows begin with the one
-    that is ``kept``.
+    All have the fields of a `PhaseGate`; the first of the ``choices`` is no gate. The state is
+    ``known`` once one is chosen, and has ``changed`` if that is another than before; its ``late``
+    is the usual number of late events of a column, ``half`` the half width of the windows of rows
+    in which it is chosen, 0 before, and ``moving`` the displacement of the line then. Windows begin
+    with the gate that is ``kept``.
     """
 
     state: Any

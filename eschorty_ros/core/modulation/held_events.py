@@ -22,7 +22,8 @@ class HeldEvents:
 
     Public attributes:
     - ``searched``: Leading events in which no phase was found.
-    - ``refused``: Events dropped because they waited too long for a phase or for light.
+    - ``refused``: Events dropped because they waited for a phase or for light too long, or until
+      the stream ended.
     """
 
     def __init__(self) -> None:

@@ -45,7 +45,8 @@ class Result:
     """Points and profiles of a recording."""
 
     points: NDArray[np.void]
-    """POINT_DTYPE, in ``eschorty_base``; ``t`` in seconds since the first event."""
+    """POINT_DTYPE, with the setting ``reflectance`` REFLECTANCE_DTYPE, in ``eschorty_base``; ``t``
+    in seconds since the first event."""
     profiles: Profiles
     """The same points before placing, with their rows and times; none where the points are in a
     file and the recording has no truth to compare them with."""
@@ -284,7 +285,7 @@ def _push(
 def stage_speed_mm_s(recording: Recording) -> float:
     """Return the stage's median speed while it cruises; 0 when it rests or has gaps alone.
 
-    Positive where the first pass is towards +y.
+    Positive where the first pass is towards +y. Raises ``FormatError`` for more than 10 m/s.
     """
     first_us, last_us = recording.stage.first_us, recording.stage.last_us
     if first_us is None or last_us is None or last_us == first_us:

@@ -66,7 +66,8 @@ class Reconstructor:
     Raises
     ------
     ArgumentError
-        When the profile is longer than the 2.1 s that the time within it can count.
+        When the profile is longer than the 2.1 s that the time within it can count, or the sensor
+        has more than 1023 rows.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 """Compensation of the row's shift where the line straddles a reflectance step.
 
 Rows on the brighter side of a step are lit further out than rows on the darker side, and the
-centroid moves towards the brighter side by up to half the difference: 2.9 px from black to white
-(the paper's Fig. 7). A single profile cannot distinguish this from a change of range. Its
+centroid moves towards the brighter side by up to half the difference: 3.75 px from black to white
+in the paper's Fig. 7. A single profile cannot distinguish this from a change of range. Its
 neighbours can: before and after the step has crossed the beam the line is as wide as either side
 alone makes it, and the width between shows how far the step has come. From which side it comes
 depends on the stage's direction and on how the camera is mounted: the rows show it.

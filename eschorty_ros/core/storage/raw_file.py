@@ -67,8 +67,8 @@ class RawReader:
     ----------
     header : Header
     warnings : list of str
-        One line per fault that does not stop the reading: no ``% end``, no geometry, no events,
-        an odd last byte. The last appears when ``chunks`` has reached the end.
+        One line per fault that does not stop the reading: no header, no ``% end``, no geometry, no
+        events, an odd last byte. The last appears when ``chunks`` or ``mapped`` is at the end.
 
     Raises
     ------

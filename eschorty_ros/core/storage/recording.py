@@ -124,7 +124,8 @@ class Recording:
     events_path : Path
         The camera's bytes, Prophesee RAW.
     stage : StageTrack
-        Stage position over sensor time; bridges any gap.
+        Stage position over sensor time; bridges any gap, of a recorded scan those that its log
+        allows.
     stage_samples : ndarray of STAGE_DTYPE, shape (n,)
         The samples of ``stage``, positions rounded to nanometres.
     modulation : Modulation

@@ -41,7 +41,7 @@ class Steps(UniformReflectance):
 
     A tile is at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
     stage band have no end. Walls between column bands run along the rays, so that no tile
-    hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm. Between
+    hides another. The default spans 207 mm around 1.32 m with steps from 2 to 76 mm. Between
     10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there, to
     its faint ends, and is on both levels over these 7 mm.
     """
