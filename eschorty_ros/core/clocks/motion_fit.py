@@ -32,8 +32,9 @@ _USUAL_READINGS = 32
 # A motion whose start is bounded less well than by two usual readings is not yet known.
 _USUAL_SPREADS = 2
 _REST_MM = 1e-4
-# A move is kept while this share of its readings agrees with it, and its speed and acceleration
-# are fitted when fewer than _AGREEING_SHARE agree, each time with 1.2 times the readings.
+# A move is kept while _KEPT_SHARE of its readings agree with it. Its speed and acceleration are
+# fitted from _READINGS_MIN readings on when fewer than _AGREEING_SHARE agree; after that each time
+# there are _REFIT_GROWTH times as many.
 _READINGS_MIN = 6
 _AGREEING_SHARE = 0.8
 _KEPT_SHARE = 0.6
