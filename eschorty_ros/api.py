@@ -28,7 +28,7 @@ class Cloud:
 
     Attributes
     ----------
-    points : ndarray of POINT_DTYPE
+    points : ndarray of POINT_DTYPE, or REFLECTANCE_DTYPE with the setting ``reflectance``
         In ``eschorty_base``, metres; ``t`` in seconds since the first event.
     profiles : Profiles
         The same points with rows, ranges in mm and sensor times.
@@ -37,7 +37,7 @@ class Cloud:
     counters : dict of str to int
         What became of the events.
     recording : Recording
-    organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
+    organized : ndarray, shape (profiles, columns), or None
         The points as a height map, with the setting ``organized``.
     """
 

@@ -64,7 +64,7 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     if not isinstance(returns, str) or returns not in RETURNS:
         raise ArgumentError(f"returns is {returns!r}; choose one of {', '.join(RETURNS)}")
     if method in FULL_COLUMN_METHODS and returns != "strongest":
-        windowed = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
+        windowed = [name for name in CENTROIDS if name not in FULL_COLUMN_METHODS]
         raise ArgumentError(
             f"returns is {returns!r} and {method!r} averages the full column; choose 'strongest', "
             f"or one of {', '.join(windowed)} as centroid"
