@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from dataclasses import replace
@@ -243,9 +244,12 @@ def _write(recording: Recording, target: BagWriter, progress: Progress | None) -
     total = recording.events_path.stat().st_size
     build, modulation = recording.calibration, recording.modulation
     target.write(CLOCK, begin_ns, header={"stamp": stamp(zero_ns)})
+    near_mm, far_mm = build.range_mm or (math.nan, math.nan)
     target.write(
         CALIBRATION, begin_ns, header={"stamp": stamp(begin_ns)}, name=build.name,
         columns=build.columns, rows=build.rows, yaml=yaml.safe_dump(build.as_dict()),
+        residual_rms=math.nan if build.residual_rms_px is None else build.residual_rms_px,
+        range_min=near_mm / MM_PER_M, range_max=far_mm / MM_PER_M,
     )  # fmt: skip
 
     def laser(t_ns: int, on: bool) -> None:

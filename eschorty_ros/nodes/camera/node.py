@@ -26,6 +26,7 @@ from eschorty_ros.nodes.camera.parameters import (
     windows_given,
 )
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
+from eschorty_ros.nodes.ros.frames import FRAME_PREFIX, frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
@@ -42,7 +43,7 @@ _LOSSES = ("drops", "gaps", "sensor_drop_words", "erc_events_dropped")
 TABLE = (
     *drivers.DRIVER,
     *EVK4_TABLE,
-    Param("frame_id", "eschorty_optical", "frame of the packets' headers"),
+    FRAME_PREFIX,
     Param(
         "event_message_time_threshold",
         0.004,
@@ -85,7 +86,7 @@ class CameraNode(DeviceNode):
             qos.events(),
             qos_overriding_options=qos.overridable(),
         )
-        self._packets = PacketPublisher(events, self.parameters["frame_id"])
+        self._packets = PacketPublisher(events, frames(self.parameters["frame_prefix"]).optical)
         self.create_subscription(
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )

@@ -30,7 +30,6 @@ from eschorty_ros.nodes.reconstruction.calibration_messages import fill_result, 
 from eschorty_ros.nodes.ros.cloud_messages import image_message
 from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
 from eschorty_ros.nodes.ros.spin import unless_shut_down
-from eschorty_ros.nodes.ros.transforms import OPTICAL
 
 _FEEDBACK_S = 0.2
 _SEARCH_S = 0.5
@@ -53,6 +52,7 @@ class Calibrator:
     - ``set_capture``: Sets the capture to feed, or ``None``; called in the worker. Raises an
       ``EschortyError`` when that is refused.
     - ``line_width_px``: Returns the width of the line in the node's settings.
+    - ``frame``: Name of the frame of the picture.
     - ``timeouts_s``: Those of ``InstrumentClient``.
     """
 
@@ -63,6 +63,7 @@ class Calibrator:
         in_worker: InWorker,
         set_capture: Callable[[Capture | None], None],
         line_width_px: Callable[[], float],
+        frame: str,
         timeouts_s: tuple[float, float, float],
     ) -> None:
         self._node = node
@@ -71,6 +72,7 @@ class Calibrator:
         self._in_worker = in_worker
         self._set_capture = set_capture
         self._line_width_px = line_width_px
+        self._frame = frame
         # Before the node spins: rclpy's action client must not be made while an executor uses it.
         self._client = InstrumentClient(node, *timeouts_s)
         self._one = threading.Lock()
@@ -122,7 +124,7 @@ class Calibrator:
         if not self._node.context.ok():
             return result
         now_ns = self._node.get_clock().now().nanoseconds
-        result.frame = image_message(capture.frame.image(), now_ns, OPTICAL)
+        result.frame = image_message(capture.frame.image(), now_ns, self._frame)
         if outcome.end is End.SUCCEEDED:
             try:
                 feedback.send("fitting")

@@ -47,6 +47,7 @@ from eschorty_ros.nodes.ros import diagnostics, qos, transforms
 from eschorty_ros.nodes.ros.border import refusals
 from eschorty_ros.nodes.ros.conversions import stage_position_mm
 from eschorty_ros.nodes.ros.executor import ShortGroup
+from eschorty_ros.nodes.ros.frames import frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
@@ -99,7 +100,10 @@ class ReconstructionNode(Node):
             self.parameters["packet_period"],
         )
         self._pipeline.stream.set_override(self._override)
-        self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
+        self._frames = frames(self.parameters["frame_prefix"])
+        self._outputs = Outputs(
+            self, self.calibration, self.parameters["profile_rate_max"], self._frames
+        )
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
         self._camera_roi = CameraRoi(self, self.parameters["camera_roi"] == "follow")
@@ -138,6 +142,7 @@ class ReconstructionNode(Node):
             self._in_worker,
             self._set_capture,
             lambda: float(values["line_width_px"]),
+            self._frames.optical,
             (values["node_timeout"], values["service_timeout"], values["events_timeout"]),
         )
 
@@ -183,7 +188,7 @@ class ReconstructionNode(Node):
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
             self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
             now_ns = self.get_clock().now().nanoseconds
-            self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
+            self._tf_static.publish(TFMessage(transforms=transforms.mounts(self._frames, now_ns)))
         steady_timer(self, _STATE_S, self._reports.publish_state, short)
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose, short)
 
@@ -225,7 +230,7 @@ class ReconstructionNode(Node):
         self._jobs.post_later(partial(self._pipeline.add_stage, t_ns, position_mm))
         if self._tf is not None and self._tf.get_subscription_count():
             x, y, z = self.calibration.stage_direction
-            carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
+            carriage = transforms.carriage(self._frames, t_ns, position_mm, (x, y, z))
             self._tf.publish(TFMessage(transforms=[carriage]))
 
     def _post(self, job: Callable[[], None]) -> None:

@@ -20,7 +20,7 @@ from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import cloud_message, image_message, serialized_cloud
-from eschorty_ros.nodes.ros.transforms import BASE, LINK, OPTICAL
+from eschorty_ros.nodes.ros.frames import Frames
 
 POINTS_INTERVAL_S = 0.05
 _FRAME_INTERVAL_S = 0.1
@@ -34,8 +34,11 @@ class Outputs:
     - ``profile_rate_max_hz``: Profiles per second of sensor time that are published at most.
     """
 
-    def __init__(self, node: Node, calibration: Calibration, profile_rate_max_hz: float) -> None:
+    def __init__(
+        self, node: Node, calibration: Calibration, profile_rate_max_hz: float, names: Frames
+    ) -> None:
         self._node, self._columns, self._rows = node, calibration.columns, calibration.rows
+        self._names = names
         self._profile_spacing_ns = round(1e9 / profile_rate_max_hz)
         override = {"qos_overriding_options": qos.overridable()}
         self._profile = node.create_publisher(PointCloud2, "profile", qos.stream(10), **override)
@@ -72,7 +75,7 @@ class Outputs:
         now_s = time.monotonic()
         if self._frame is not None and now_s - self._frame_at_s >= _FRAME_INTERVAL_S:
             self._frame_at_s = now_s
-            self._image.publish(image_message(self._frame.render(), stamp_ns, OPTICAL))
+            self._image.publish(image_message(self._frame.render(), stamp_ns, self._names.optical))
 
     def profiles(self, fresh: list[TimedProfiles]) -> None:
         """Publish each profile, or as many as the maximum rate allows."""
@@ -83,7 +86,7 @@ class Outputs:
                 stamp_ns = int(profile.t_ns.min())
                 points = place_link(profile.profiles, profile.model)
                 live = live_points(points, profile.t_ns, stamp_ns)
-                self._profile.publish(serialized_cloud([live], stamp_ns, LINK))
+                self._profile.publish(serialized_cloud([live], stamp_ns, self._names.link))
 
     def _spaced(self, timed: TimedProfiles) -> Iterator[TimedProfiles]:
         """Yield each profile that the maximum rate allows."""
@@ -120,7 +123,7 @@ class Outputs:
                     left.append((points[later], t_ns[later]))
                     points, t_ns = points[~later], t_ns[~later]
                 live.append(live_points(points, t_ns, stamp_ns))
-            self._points.publish(serialized_cloud(live, stamp_ns, BASE))
+            self._points.publish(serialized_cloud(live, stamp_ns, self._names.base))
             parts = left
 
     def scan(self, scan: AssembledScan, fallback_stamp_ns: int, organized: bool) -> None:
@@ -133,4 +136,4 @@ class Outputs:
             except ArgumentError as error:
                 # The parameter returns was changed during the scan.
                 self._node.get_logger().warning(f"scan/points is not organized: {error}")
-        self._scan.publish(cloud_message(points, stamp_ns, BASE))
+        self._scan.publish(cloud_message(points, stamp_ns, self._names.base))

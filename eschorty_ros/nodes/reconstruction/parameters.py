@@ -10,6 +10,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.nodes.ros.frames import FRAME_PREFIX
 from eschorty_ros.nodes.ros.parameters import Param
 
 TABLE = (
@@ -48,6 +49,7 @@ TABLE = (
     Param("events_timeout", 3.0, "calibration: longest pause of the events while the laser is on",
           "s", 0.1, 60.0),
     Param("publish_tf", True, "publish /tf and /tf_static"),
+    FRAME_PREFIX,
 )  # fmt: skip
 
 

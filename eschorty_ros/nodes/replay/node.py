@@ -31,11 +31,11 @@ from eschorty_ros.live.recorded_packets import TimedPacket, timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.nodes.ros.frames import FRAME_PREFIX, frames
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.nodes.ros.spin import run, unless_shut_down
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
-from eschorty_ros.nodes.ros.transforms import BASE, OPTICAL, STAGE
 from eschorty_ros.srv import BeginScan, EndScan
 
 TABLE = (
@@ -43,6 +43,7 @@ TABLE = (
     Param("rate", 1.0, "speed against real time; 0 is as fast as possible", "", 0.0, 1e6),
     Param("timeout", 30.0, "longest wait for the reconstruction and for its progress", "s",
           0.1, 3600.0),
+    FRAME_PREFIX,
 )  # fmt: skip
 
 _PACKETS_AHEAD = 256
@@ -69,6 +70,7 @@ class ReplayNode(Node):
         self._player = threading.Thread(target=self._run, name="replay", daemon=True)
         super().__init__("replay", **kwargs)
         self.parameters = Parameters(self, TABLE)
+        self._frames = frames(self.parameters["frame_prefix"])
         if not self.parameters["recording"]:
             raise ArgumentError("parameter recording is empty; give a recording folder")
         path = Path(self.parameters["recording"])
@@ -282,7 +284,7 @@ class ReplayNode(Node):
             message = EventPacket(height=height, width=width, seq=seq, encoding="evt3")
             message.events.frombytes(packet.data)
             message.header.stamp = stamp_from_ns(self._ns(packet.from_us))
-            message.header.frame_id = OPTICAL
+            message.header.frame_id = self._frames.optical
             self._events.publish(message)
             seq += 1
             pending.append(until_us)
@@ -304,8 +306,8 @@ class ReplayNode(Node):
         rows = self._recording.stage_samples
         while self._next_row < len(rows):
             t_us = int(rows["t_us"][self._next_row])
-            message = Odometry(child_frame_id=STAGE)
-            message.header.frame_id = BASE
+            message = Odometry(child_frame_id=self._frames.stage)
+            message.header.frame_id = self._frames.base
             message.header.stamp = stamp_from_ns(self._ns(t_us))
             position_mm = float(rows["position_mm"][self._next_row])
             message.pose.pose.position.y = m_from_mm(position_mm)

@@ -64,6 +64,8 @@ _BEGIN_S = 20.0
 _LATE_NODE_WAIT_S = 0.3
 _LEAST_WAIT_S = 0.1
 _CLOCKS_S = 20.0
+# The laser's node logs every refusal.
+_ENABLE_AGAIN_S = 0.25
 
 
 class InstrumentClient(PacedWaiting):
@@ -247,7 +249,9 @@ class InstrumentClient(PacedWaiting):
             # The heartbeats of a camera and a stage that have just started come soon.
             if _HEARTBEAT not in refusal or time.monotonic() > ends_s:
                 raise ScanFailure(f"laser: {refusal}")
-            self.tick()
+            again_s = time.monotonic() + _ENABLE_AGAIN_S
+            while time.monotonic() < again_s:
+                self.tick()
         self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
                   "laser: its output does not read back on")  # fmt: skip
 

@@ -9,7 +9,12 @@ from typing import Any
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from eschorty_ros.core.base.errors import DeviceError, DeviceNotReadyError, EschortyError
+from eschorty_ros.core.base.errors import (
+    ArgumentError,
+    DeviceError,
+    DeviceNotReadyError,
+    EschortyError,
+)
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
@@ -41,6 +46,8 @@ class DeviceNode(LifecycleNode):
     - ``failure``: The last failure, empty after a successful configure.
     - ``waiting``: The reason for waiting and the time of the next attempt, ``""`` when it does not
       wait.
+
+    Raises ``ArgumentError`` for simulated time, in which a device seems to jump or to stand still.
     """
 
     def __init__(
@@ -51,6 +58,10 @@ class DeviceNode(LifecycleNode):
         **kwargs: Any,
     ) -> None:
         super().__init__(name, **kwargs)
+        if self.get_parameter("use_sim_time").value:
+            raise ArgumentError(
+                f"use_sim_time is true, but devices run in the host's time; leave it out for {name}"
+            )
         self.parameters = Parameters(self, (AUTO_START, *table), on_change)
         self.failure = ""
         self.waiting = ""

@@ -23,6 +23,7 @@ from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger, StageLimits
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.ros.frames import FRAME_PREFIX, frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
@@ -41,8 +42,7 @@ TABLE = (
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
     Param("home_timeout", 60.0, "longest time for homing", "s", 1.0, 600.0),
-    Param("base_frame", "eschorty_base", "frame of the stage's base"),
-    Param("stage_frame", "eschorty_stage", "frame of the carriage"),
+    FRAME_PREFIX,
 )
 
 
@@ -62,6 +62,7 @@ class StageNode(DeviceNode):
         self._busy = threading.Lock()
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
+        self._frames = frames(self.parameters["frame_prefix"])
         self.moves = 0
         self._command_errors = 0.0
         self._published_ns, self._rested = 0, False
@@ -260,7 +261,7 @@ class StageNode(DeviceNode):
             self._odom.publish(self._odometry(state))
 
     def _header(self) -> Header:
-        return Header(frame_id=self.parameters["base_frame"], stamp=stamp_from_ns(self.now_ns()))
+        return Header(frame_id=self._frames.base, stamp=stamp_from_ns(self.now_ns()))
 
     def _limits_message(self, stage: LinearStage) -> StageLimits:
         low, high = (m_from_mm(end_mm) for end_mm in stage.travel_mm)
@@ -281,8 +282,8 @@ class StageNode(DeviceNode):
         return message
 
     def _odometry(self, state: StageState) -> Odometry:
-        message = Odometry(child_frame_id=self.parameters["stage_frame"])
-        message.header.frame_id = self.parameters["base_frame"]
+        message = Odometry(child_frame_id=self._frames.stage)
+        message.header.frame_id = self._frames.base
         message.header.stamp = stamp_from_ns(state.t_ns)
         message.pose.pose.position.y = m_from_mm(state.position_mm)
         message.pose.pose.orientation.w = 1.0

@@ -15,10 +15,12 @@ from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.reconstruction import outputs as outputs_module
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.ros.frames import frames
 
 CALIBRATION = load_calibration("config_3")
 ZERO_NS = 1_800_000_000_000_000_000
 COLUMNS = 3
+FRAMES = frames("left_")
 
 
 class Publisher(list):
@@ -64,11 +66,12 @@ def times_ns(message):
 
 def test_every_profile_is_a_message_stamped_with_its_first_point():
     node = Node()
-    outputs = Outputs(node, CALIBRATION, 1000.0)
+    outputs = Outputs(node, CALIBRATION, 1000.0, FRAMES)
     fresh = timed([0, 1000, 2000]), timed([3000])
     outputs.profiles(list(fresh))
     messages = node.topics["profile"]
     assert len(messages) == 4
+    assert {message.header.frame_id for message in messages} == {"left_link"}
     for number, message in enumerate(messages):
         edge_ns = ZERO_NS + number * 1_000_000
         assert ns_from_stamp(message.header.stamp) == edge_ns + 80_000
@@ -81,7 +84,7 @@ def test_every_profile_is_a_message_stamped_with_its_first_point():
 @pytest.mark.parametrize("pieces", [1, 4])
 def test_the_rate_of_profiles_is_bounded(pieces):
     node = Node()
-    outputs = Outputs(node, CALIBRATION, 250.0)
+    outputs = Outputs(node, CALIBRATION, 250.0, FRAMES)
     for edges_us in np.split(np.arange(12) * 1000, pieces):
         outputs.profiles([timed(edges_us)])
     begins_ns = [ns_from_stamp(message.header.stamp) for message in node.topics["profile"]]
@@ -92,11 +95,12 @@ def test_points_further_apart_than_a_message_can_hold_are_in_two():
     node = Node()
     far = timed([0, 1000, 4_100_000, 8_300_000])
     points = place(far.profiles, CALIBRATION.model(), 0.0, CALIBRATION.stage_direction)
-    Outputs(node, CALIBRATION, 1000.0).points(
+    Outputs(node, CALIBRATION, 1000.0, FRAMES).points(
         [PlacedPoints(points, far.t_ns, far.edge_ns, np.zeros(len(points)))]
     )
     messages = node.topics["points"]
     assert [message.width for message in messages] == [6, 3, 3]
+    assert {message.header.frame_id for message in messages} == {"left_base"}
     assert [t for message in messages for t in times_ns(message)] == far.t_ns.tolist()
 
 
@@ -104,7 +108,7 @@ def test_points_wait_until_they_are_due(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(outputs_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     node = Node()
-    outputs = Outputs(node, CALIBRATION, 1000.0)
+    outputs = Outputs(node, CALIBRATION, 1000.0, FRAMES)
     near = timed([0])
     points = place(near.profiles, CALIBRATION.model(), 0.0, CALIBRATION.stage_direction)
     placed = PlacedPoints(points, near.t_ns, near.edge_ns, np.zeros(len(points)))

@@ -55,6 +55,14 @@ def run(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         yield lambda *answers: start(functools.partial(Instrument, Device(*answers)))
 
 
+def test_simulated_time_is_refused(observer) -> None:
+    with (
+        nodes_here(observer.domain) as start,
+        pytest.raises(ArgumentError, match=r"use_sim_time is true.* leave it out for instrument"),
+    ):
+        start(functools.partial(Instrument, Device(None)), use_sim_time=True)
+
+
 def test_an_absent_device_is_retried_and_logged_once_per_reason(run, observer, capfd) -> None:
     reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
     absent, held = DeviceError("no camera found; plug it in"), DeviceError("camera is held")
