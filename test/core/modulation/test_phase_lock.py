@@ -1,8 +1,10 @@
 """An unknown phase is found, and tracked while the generator's clock drifts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from reconstructing import reconstruct
+from reconstructing import CALIBRATION, reconstruct
 
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
@@ -11,10 +13,12 @@ from eschorty_ros.core.reconstruction import Settings
 SEED = 5
 SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0, periods_per_profile=1)
 EDGE_US = 1000
+COLUMNS = 16
+NARROW = replace(CALIBRATION, columns=COLUMNS)
 
 
 def bursts(frequency_hz, seconds, ppm=0.0, *, per_period=32, edge_us=EDGE_US, duty=0.5, seed=SEED):
-    """Events of 16 columns: half after each edge of a generator whose period is ``ppm`` longer."""
+    """Events of all columns: half after each edge of a generator whose period is ``ppm`` longer."""
     rng = np.random.default_rng(seed)
     period_us = 1e6 / frequency_hz * (1 + ppm * 1e-6)
     k = np.arange(int(seconds * 1e6 / period_us))
@@ -28,7 +32,7 @@ def bursts(frequency_hz, seconds, ppm=0.0, *, per_period=32, edge_us=EDGE_US, du
     p.append(rng.integers(0, 2, noise))
     t = np.rint(np.concatenate(t)).astype(np.int64)
     y = np.clip(np.rint(rng.normal(300.0, 8.0, t.size)), 0, 719)
-    x = rng.integers(0, 16, t.size)
+    x = rng.integers(0, COLUMNS, t.size)
     return sort_readout(
         t, x.astype(np.uint16), y.astype(np.uint16), np.concatenate(p).astype(np.uint8)
     )
@@ -38,7 +42,7 @@ def noise(begin_us, end_us, count, seed=SEED):
     rng = np.random.default_rng(seed)
     return sort_readout(
         rng.integers(begin_us, end_us, count),
-        rng.integers(0, 16, count).astype(np.uint16),
+        rng.integers(0, COLUMNS, count).astype(np.uint16),
         rng.integers(0, 720, count).astype(np.uint16),
         rng.integers(0, 2, count).astype(np.uint8),
     )
@@ -49,7 +53,7 @@ def joined(*parts):
 
 
 def edges_of(data, modulation, cuts=()):
-    found, reconstructor = reconstruct(data, modulation, SINGLE, cuts)
+    found, reconstructor = reconstruct(data, modulation, SINGLE, cuts, NARROW)
     return np.unique(found.edge_us), reconstructor.counters
 
 
