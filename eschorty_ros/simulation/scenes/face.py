@@ -46,6 +46,9 @@ _BUMPS = (
     (0.0, -83.0, 18.0, 13.0, 12.0),  # chin
 )
 
+_Height = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
+"""Height over the front of the face, of places ``up`` along the line, and a mask of the surface."""
+
 
 @dataclass(frozen=True)
 class Face:
@@ -98,7 +101,7 @@ class Face:
             if rows.size == 0 or cols.size == 0:
                 continue
             part = np.ix_(rows, cols)
-            found, found_up = _solve(across[rows], slope[:, cols], depth_mm, height)
+            found, found_up = _solve(rows.size, slope[:, cols], depth_mm, height(across[rows]))
             nearer = ~(x[part] <= found - model.b_mm) & ~np.isnan(found)
             x[part] = np.where(nearer, found - model.b_mm, x[part])
             up[part] = np.where(nearer, found_up, up[part])
@@ -109,48 +112,54 @@ def _bell(at: Array, centre: float, half_width: float) -> Array:
     return np.asarray(np.exp(-(((at - centre) / half_width) ** 2)))
 
 
-def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the height of the head towards the sensor, and a mask of the head."""
-    jaw = 1.0 - 0.22 / (1.0 + np.exp((up + 55.0) / 14.0))
-    squared = (across / (HEAD_HALF_WIDTH_MM * jaw)) ** 2 + (up / HEAD_HALF_HEIGHT_MM) ** 2
-    height = -HEAD_DEPTH_MM * np.minimum(squared, 1.5) ** 1.3
+def _head_mm(across: Array) -> _Height:
+    """Return the height of the head towards the sensor."""
+    bumps = []
     for off, line, half_across, half_up, bump in _BUMPS:
         sides = (off, -off) if off else (0.0,)
         bells = np.array(sum(_bell(across, side, half_across) for side in sides))
         bells[bells < _BELL_END] = 0.0
         if bells.any():
-            height = height + bump * bells * _bell(up, line, half_up)
-    return height, squared <= 1.0
+            bumps.append((bump * bells, line, half_up))
+
+    def height_mm(up: Array) -> tuple[Array, NDArray[np.bool_]]:
+        jaw = 1.0 - 0.22 / (1.0 + np.exp((up + 55.0) / 14.0))
+        squared = (across / (HEAD_HALF_WIDTH_MM * jaw)) ** 2 + (up / HEAD_HALF_HEIGHT_MM) ** 2
+        height = -HEAD_DEPTH_MM * np.minimum(squared, 1.5) ** 1.3
+        for bump_mm, line, half_up in bumps:
+            height += bump_mm * _bell(up, line, half_up)
+        return height, squared <= 1.0
+
+    return height_mm
 
 
-def _ear_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the height of the ears, flat shells with a rim, and a mask of the ears."""
+def _ear_mm(across: Array) -> _Height:
+    """Return the height of the ears, flat shells with a rim."""
     aside = np.abs(across) - EAR_OFF_MM
-    squared = (aside / _EAR_HALF_MM[0]) ** 2 + ((up - _EAR_LINE_MM) / _EAR_HALF_MM[1]) ** 2
-    rim = 4.0 * np.exp(-(((squared - 0.75) / 0.25) ** 2))
-    return rim - EAR_DEPTH_MM + 0.3 * np.clip(aside, -20.0, 20.0), squared <= 1.0
+
+    def height_mm(up: Array) -> tuple[Array, NDArray[np.bool_]]:
+        squared = (aside / _EAR_HALF_MM[0]) ** 2 + ((up - _EAR_LINE_MM) / _EAR_HALF_MM[1]) ** 2
+        rim = 4.0 * np.exp(-(((squared - 0.75) / 0.25) ** 2))
+        return rim - EAR_DEPTH_MM + 0.3 * np.clip(aside, -20.0, 20.0), squared <= 1.0
+
+    return height_mm
 
 
-def _solve(
-    across: Array,
-    slope: Array,
-    depth_mm: float,
-    height: Callable[[Array, Array], tuple[Array, NDArray[np.bool_]]],
-) -> tuple[Array, Array]:
-    """Return depth and height where ``x = depth - height(across, slope x)``, by secants.
+def _solve(lines: int, slope: Array, depth_mm: float, height_mm: _Height) -> tuple[Array, Array]:
+    """Return depth and height where ``x = depth - height(slope x)``, by secants.
 
     Rays are within 7 degrees of the x axis, so that ``x -> depth - height`` shrinks every error
     about fivefold even at the head's rim, and the secants leave less than 1 um.
     """
-    before = np.broadcast_to(np.float64(depth_mm), (across.size, slope.size))
-    x = depth_mm - height(across, slope * before)[0]
+    before = np.broadcast_to(np.float64(depth_mm), (lines, slope.size))
+    x = depth_mm - height_mm(slope * before)[0]
     change = x - before
     for _ in range(_SOLVE_STEPS - 2):
-        new_change = depth_mm - height(across, slope * x)[0] - x
+        new_change = depth_mm - height_mm(slope * x)[0] - x
         bend = change - new_change
         step = np.divide(new_change * (x - before), bend, out=new_change.copy(), where=bend != 0.0)
         before, change = x, new_change
         x = x + step
     up = slope * x
-    final, there = height(across, up)
+    final, there = height_mm(up)
     return np.where(there, depth_mm - final, np.nan), np.where(there, up, np.nan)
