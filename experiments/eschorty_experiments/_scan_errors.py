@@ -93,13 +93,12 @@ def scan_errors(
     model = recording.calibration.model()
     profiles = profiles.select(profiles.column % every == 0)
     stage_mm = np.asarray(recording.stage.position_mm(profiles.t_us))
-    truth_mm = true_range_mm(scene, model, stage_mm, profiles.column)
-    beside_px = [
-        model.row(true_range_mm(scene, model, stage_mm + off_mm, profiles.column))
-        for off_mm in (-RIM_MM, RIM_MM)
-    ]
+    # At once: a scene takes about as long for three stage positions as for one.
+    stages_mm = np.concatenate([stage_mm + off_mm for off_mm in (0.0, -RIM_MM, RIM_MM)])
+    columns = np.tile(profiles.column, 3)
+    truth_mm, *beside_mm = np.split(true_range_mm(scene, model, stages_mm, columns), 3)
     rows = model.row(truth_mm)
-    inside = np.all([np.abs(beside - rows) <= GROSS_PX for beside in beside_px], axis=0)
+    inside = np.all([np.abs(model.row(mm) - rows) <= GROSS_PX for mm in beside_mm], axis=0)
     off_px = np.abs(profiles.row - rows)
     truth = recording.truth
     assert truth is not None, "a simulated recording has its truth"
