@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
 from eschorty_ros.core.line import CENTROIDS
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import NOISE_FILTERS, Profiles, Reconstructor, Settings
 from eschorty_ros.core.reconstruction import paper_method as reference
 from eschorty_ros.core.storage import Recording
@@ -144,14 +144,17 @@ class Measured:
 
 
 def record_streams(
-    travel_mm: tuple[float, float], seed: int, note: Callable[[str], None]
+    travel_mm: tuple[float, float], columns: int, seed: int, note: Callable[[str], None]
 ) -> list[Stream]:
-    """Record every scene with every background."""
+    """Record every scene with every background, on the columns in the middle of the line."""
     streams = []
+    calibration = replace(
+        load_calibration("config_3"), columns=columns, principal_column=0.5 * (columns - 1)
+    )
     for name in SCENES:
         scene = named(name)
         note(f"simulating {name}")
-        noiseless = _record(name, scene, 0.0, 0.0, travel_mm, seed)
+        noiseless = _record(name, scene, 0.0, 0.0, calibration, travel_mm, seed)
         streams.append(noiseless)
         model = noiseless.recording.calibration.model()
         t_us = noiseless.recording.stage_samples["t_us"]
@@ -159,7 +162,7 @@ def record_streams(
         for share in BACKGROUND_SHARES:
             if share:
                 rate_hz = noiseless.events * share / (1.0 - share) / pixel_seconds
-                streams.append(_record(name, scene, share, rate_hz, travel_mm, seed))
+                streams.append(_record(name, scene, share, rate_hz, calibration, travel_mm, seed))
     return streams
 
 
@@ -168,6 +171,7 @@ def _record(
     scene: Scene,
     share: float,
     background_hz: float,
+    calibration: Calibration,
     travel_mm: tuple[float, float],
     seed: int,
 ) -> Stream:
@@ -175,7 +179,7 @@ def _record(
         recording = simulate_recording(
             Path(folder),
             scene,
-            load_calibration("config_3"),
+            calibration,
             Modulation(FREQUENCY_HZ),
             *travel_mm,
             SPEED_MM_S,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ from eschorty_experiments._leaf_levels import (
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.optics import COLUMNS, Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Result, reconstruct_recording
 from eschorty_ros.report import figures
 from eschorty_ros.report.experiment import (
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 SPEED_MM_S = 300.0
 TRAVEL_MM = (0.0, 200.0)
 HALF_MM, STRIP_MM = (50.0, 150.0), (75.0, 120.0)
+FAST_COLUMNS = 640
+"""Of a fast run, in the middle of the line."""
 
 FREQUENCIES_HZ = (70.0, 1000.0)
 NEAR_FACE_MM, FAR_FACE_MM = 1000.0, 2430.0
@@ -54,6 +56,13 @@ class Case:
     build: str
     frequency_hz: float
     travel_mm: tuple[float, float]
+    columns: int
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the build, with the columns in the middle."""
+        middle = 0.5 * (self.columns - 1)
+        return replace(load_calibration(self.build), columns=self.columns, principal_column=middle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +81,9 @@ class Scanned:
 
 
 def cases(effort: Effort) -> list[Case]:
-    """Return the scans; a fast run has half of the leaves, and at 1 kHz only a strip of them."""
+    """Return the scans; a fast run has a part of the travel, at 1 kHz a strip of the leaves."""
     made = []
+    columns = effort.choose(COLUMNS, FAST_COLUMNS)
     for name, title, scene, build in (
         ("leaves", "leaves at 1.32 m", Leaves(), "config_3"),
         ("face_near", "face at 1 m", Face(NEAR_FACE_MM), "config_3"),
@@ -83,9 +93,9 @@ def cases(effort: Effort) -> list[Case]:
             costly = effort.fast and hz > 100.0
             if not costly:
                 travel = HALF_MM if effort.fast and isinstance(scene, Leaves) else TRAVEL_MM
-                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, travel))
+                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, travel, columns))
             elif isinstance(scene, Leaves):
-                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, STRIP_MM))
+                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, STRIP_MM, columns))
     return made
 
 
@@ -106,7 +116,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         outcome.captions[case.name] = f"{case.title} ({case.build}), {SPEED_MM_S:g} mm/s, {hz:g} Hz"
         if isinstance(case.scene, Leaves):
             residuals[one.label] = level_residuals(
-                case.scene, one.result, load_calibration(case.build).model(), SPEED_MM_S / hz
+                case.scene, one.result, case.calibration.model(), SPEED_MM_S / hz
             )
             steps[one.label] = level_steps(residuals[one.label])
             outcome.findings.extend(_separation_findings(one.label, steps[one.label]))
@@ -131,7 +141,7 @@ def scan(case: Case, seed: int) -> Scanned:
         recording = simulate_recording(
             Path(folder),
             case.scene,
-            load_calibration(case.build),
+            case.calibration,
             Modulation(case.frequency_hz),
             *case.travel_mm,
             SPEED_MM_S,

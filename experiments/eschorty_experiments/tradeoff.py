@@ -46,13 +46,15 @@ from eschorty_ros.report.experiment import (
 
 TRAVEL_MM = (70.0, 130.0)
 FAST_TRAVEL_MM = (90.0, 110.0)
+FAST_COLUMNS = 640
 MEMORY_STREAM = ("leaves", 0.05)
 
 
 def run(effort: Effort, progress: Progress) -> Outcome:
     """Run every variant on every scene and background; a fast run changes one setting at a time."""
     travel_mm = FAST_TRAVEL_MM if effort.fast else TRAVEL_MM
-    streams = record_streams(travel_mm, effort.seed, lambda note: progress(0.0, note))
+    columns = effort.choose(COLUMNS, FAST_COLUMNS)
+    streams = record_streams(travel_mm, columns, effort.seed, lambda note: progress(0.0, note))
     todo = one_change() if effort.fast else variants()
     measured: list[Measured] = []
     for k, variant in enumerate(todo):
@@ -79,7 +81,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         },
         figures={"pareto": pareto_figure(summaries)},
         captions=_captions(),
-        remarks=_remarks(summaries, precision),
+        remarks=_remarks(summaries, precision, columns),
     )
 
 
@@ -144,7 +146,7 @@ def _findings(summaries: Sequence[Summary]) -> list[Finding]:
     return findings
 
 
-def _remarks(summaries: Sequence[Summary], precision: DataTable) -> list[str]:
+def _remarks(summaries: Sequence[Summary], precision: DataTable, columns: int) -> list[str]:
     chosen, base = of(summaries, Variant(DEFAULT)), of(summaries, Variant(None))
     at = [one for one in summaries if one.background_share == TYPICAL]
     front = pareto_front([(one.ns_per_event, one.errors.rmse_mm) for one in at])
@@ -156,7 +158,7 @@ def _remarks(summaries: Sequence[Summary], precision: DataTable) -> list[str]:
     )
     gated = of(summaries, Variant(replace(DEFAULT, phase_gate_us=GATE_US)))
     gate_time = gated[TYPICAL].ns_per_event / typical.ns_per_event
-    column_ns = typical.us_per_profile * 1e3 / COLUMNS
+    column_ns = typical.us_per_profile * 1e3 / columns
     range_ns = float(precision.rows[0][-1])
     return [
         f"The default is {Variant(DEFAULT).label}: at {100 * TYPICAL:g} % background "
