@@ -97,9 +97,10 @@ reference: $(SETUP)
 # Nodes and devices that need no kernels go beside compiling or the pure parts, which share the cores, the
 # longest first; then whole scans go beside the rest. The emulated bench runs in real time, and a computer
 # that stalls fails a scan: what failed runs once more, all of it after a test that hung.
-PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
+PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer \
+          cli/test_calibrate_command.py)
 DEVICES := $(addprefix test/,hardware nodes/laser nodes/stage)
-SCANS := test/nodes/scanner
+SCANS := $(addprefix test/nodes/,scanner test_hostile_messages.py)
 NODES := test/launch test/nodes
 REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS) $(NODES))
 test-%: run = pytest $(tests) -o cache_dir=$(BUILD)/$@
