@@ -4,7 +4,8 @@ All events of a line that is at rest and symmetric have the same mean row. Where
 fewer events than the pixels give, and loses them in the order of the rows, those at the height of
 the burst have lost one side of the line, and the later ones have not. What the bursts of both
 polarities show is an uncertainty of the row; one of them alone differs where pixels answer the two
-edges of the laser differently.
+edges of the laser differently. A line that passes an edge has lost one side, too, but not to the
+readout: the sums start again behind the edge.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ _LATE = 1 << 26
 _STEP = 1.0 / 128.0
 # Difference of both parts over the standard deviation by which whole pixels move the mean row.
 _EXPLAINED = 12.0
-# Profiles without which a shift is chance. From then on one of as many is compared.
+# Profiles without which a shift is chance. From then on one of as many is added.
 _PROFILES_MIN = 4
 # Standard deviations of a sum over blocks that chance may have; each column is in three of them.
 _BY_CHANCE = 2.0 * np.sqrt(3.0)
 # Least mean product of the shifts of both polarities, px squared: 0.0 to 0.2 where nothing is lost.
+# Where an edge that passes adds more to the variance of the row, it may cause such shifts.
 _PRODUCT_MIN = 0.5
 
 
@@ -49,25 +51,27 @@ class Bursts(NamedTuple):
     """Sums over recent profiles by block of columns, polarity and part of the burst.
 
     Early events, part 0, are before the phase ``late``, of 2**32 per turn: three of four. The first
-    and the last block are outside the sensor.
+    and the last block are outside the sensor. The sums of a block are of so many ``profiles``.
     """
 
     events: NDArray[np.float64]
     rows_px: NDArray[np.float64]
     late: NDArray[np.float64]
+    profiles: NDArray[np.int64]
 
 
 def empty_bursts(columns: int) -> Bursts:
     """Return no bursts."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     events, rows_px = np.zeros((2, blocks, 2, 2))
-    return Bursts(events, rows_px, np.full((blocks, 2), float(_LATE)))
+    late = np.full((blocks, 2), float(_LATE))
+    return Bursts(events, rows_px, late, np.zeros(blocks, np.int64))
 
 
 @kernel(_nrt=True)
 def _forget_bursts(bursts):
     bursts.events[:], bursts.rows_px[:] = 0.0, 0.0
-    bursts.late[:] = _LATE
+    bursts.late[:], bursts.profiles[:] = _LATE, 0
 
 
 @kernel(_nrt=False)
@@ -146,21 +150,33 @@ def _is_taken(columns, c, seed, half):
 
 
 @kernel(_nrt=False)
-def _compare_bursts(columns, half, profiles, blink, steps_px, common2, bursts, shift_px):
+def _keep_sums(bursts, block, share):
+    """Keep a ``share`` of the sums of a block."""
+    for polarity in range(2):
+        for part in range(2):
+            bursts.events[block, polarity, part] *= share
+            bursts.rows_px[block, polarity, part] *= share
+
+
+@kernel(_nrt=False)
+def _compare_bursts(columns, half, profiles, blink, common2, bursts, history):
     """Add one column of each block, and set the shifts of the bursts after so many ``profiles``.
 
-    Lines move by ``steps_px`` from profile to profile, by block; ``common2`` are the variances that
-    the rows of neighbours share, px squared, by column.
+    ``common2`` are the variances that the rows of neighbours share, px squared, by column.
     """
-    if blink.step == 0 or (profiles > _PROFILES_MIN and profiles % _PROFILES_MIN > 0):
+    if blink.step == 0:
         return
+    shift_px, sets = history.shift_px, profiles % _PROFILES_MIN == 0
     place = (profiles + profiles // _PROFILES_MIN) % BLOCK_COLUMNS
     blocks, products, squares = 0, 0.0, 0.0
     for block in range(1, shift_px.size - 1):
-        for polarity in range(2):
-            for part in range(2):
-                bursts.events[block, polarity, part] *= _KEPT
-                bursts.rows_px[block, polarity, part] *= _KEPT
+        if history.passing2[block] > _PRODUCT_MIN:
+            _keep_sums(bursts, block, 0.0)
+            bursts.profiles[block], shift_px[block] = 0, 0.0
+            continue
+        if bursts.profiles[block] > _PROFILES_MIN and not sets:
+            continue
+        _keep_sums(bursts, block, _KEPT)
         c = np.uintp((block - 1) * BLOCK_COLUMNS + place)
         shift_px[block] = 0.0
         if c >= columns.seeds.size or columns.seeds[c] < 0 or np.isnan(common2[c]):
@@ -169,7 +185,10 @@ def _compare_bursts(columns, half, profiles, blink, steps_px, common2, bursts, s
         if not _is_taken(columns, c, seed, half):
             continue
         _add_column(columns.packed, start, seed, half, blink, block, bursts)
-        explained_px = steps_px[block] + _EXPLAINED * np.sqrt(common2[c])
+        bursts.profiles[block] += 1
+        if bursts.profiles[block] < _PROFILES_MIN or not sets:
+            continue
+        explained_px = history.step_px[block] + _EXPLAINED * np.sqrt(common2[c])
         on = _difference(bursts, block, 1, explained_px)
         off = _difference(bursts, block, 0, explained_px)
         shift_px[block] = min(abs(on), abs(off)) if on * off > 0.0 else 0.0
@@ -177,5 +196,5 @@ def _compare_bursts(columns, half, profiles, blink, steps_px, common2, bursts, s
         squares += (on * off) ** 2
         blocks += 1
     chance = _BY_CHANCE * np.sqrt(squares)
-    if profiles < _PROFILES_MIN or products < max(_PRODUCT_MIN * blocks, chance):
+    if sets and products < max(_PRODUCT_MIN * blocks, chance):
         shift_px[:] = 0.0

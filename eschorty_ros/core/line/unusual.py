@@ -135,8 +135,14 @@ def _restart_widths(widths, known):
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
-    history.shift_px[:] = 0.0
+    history.passing2[:], history.shift_px[:] = 0.0, 0.0
     _update(widths, widths.smoothed.shape[1])
+
+
+@kernel(_nrt=False)
+def _is_known(widths):
+    """Return whether enough points have shown what width is usual."""
+    return widths.below[_BINS] >= _POINTS_MIN
 
 
 @kernel(_nrt=False)
@@ -199,7 +205,7 @@ def _follow_line(rows, smoothing, lit_share):
     row, widths = smoothing.row, smoothing.widths
     now, static_width, median = widths.history.now, widths.static_width, widths.usual.median
     returns, columns = row.shape
-    known = widths.below[_BINS] >= _POINTS_MIN
+    known = _is_known(widths)
     usual = median.width if known else np.inf
     for k in range(returns):
         _without_motion(
@@ -240,7 +246,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
     smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
-    known = widths.below[_BINS] >= _POINTS_MIN
+    known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
     pairs = widths.below[_BINS] + 1.0

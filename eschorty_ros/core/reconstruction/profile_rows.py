@@ -65,6 +65,7 @@ from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth, empty_smoothing
 from eschorty_ros.core.line.unusual import (
     UsualWidths,
+    _is_known,
     _keep_widths,
     _mark_unusual,
     _restart_widths,
@@ -351,16 +352,16 @@ def _follow(memory, half, restarted):
     ``restarted`` says that the laser or the period's edge has started again.
     """
     state, columns, blink = memory.state, memory.columns, memory.blink
-    history, place = memory.smoothing.widths.history, state.profiles % BLOCK_COLUMNS
+    widths, place = memory.smoothing.widths, state.profiles % BLOCK_COLUMNS
+    history = widths.history
     if restarted:
         blink.lines[:] = 0.0
     _add_lines(columns, half, place, blink)
     _compare_polarities(columns, half, place, history)
-    if history.windowed:
-        _compare_bursts(
-            columns, half, state.profiles, blink, history.step_px, memory.rows.common2[0],
-            memory.bursts, history.shift_px,
-        )  # fmt: skip
+    # Before a width is usual, an edge that passes is not seen.
+    if history.windowed and _is_known(widths):
+        common2 = memory.rows.common2[0]
+        _compare_bursts(columns, half, state.profiles, blink, common2, memory.bursts, history)
     state.profiles += 1
 
 

@@ -88,6 +88,16 @@ def test_lines_that_the_limits_of_the_range_cut_are_no_fault_of_the_camera(tmp_p
     assert (result.warnings, len(result.points) > 0) == ((), True)
 
 
+@pytest.mark.parametrize("start_mm", [51.2, 51.8])
+def test_a_step_that_passes_at_first_is_no_fault_of_the_camera(tmp_path, start_mm):
+    build = replace(NARROW, columns=480, principal_column=239.5)
+    sweep = {"start_mm": start_mm, "stop_mm": 75.0, "seed": 0}
+    result = reconstruct_recording(simulate_recording(tmp_path, named("steps"), build, **sweep))
+    assert result.warnings == (), "seed 0"
+    # 0.25 px where no step passes at first.
+    assert np.median(result.profiles.sigma_row) < 0.4, "seed 0"
+
+
 def test_a_short_sweep_far_from_zero_is_not_in_metres(tmp_path):
     recording = simulate_recording(
         tmp_path, Plane(1300.0), NARROW, start_mm=10.0, stop_mm=10.1, speed_mm_s=1.0
