@@ -137,7 +137,8 @@ def test_a_cloud_of_a_stage_at_rest_has_one_line(tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-def test_the_command_prints_values_with_their_sigma(tmp_path):
+def test_the_command_prints_values_with_their_sigma(tmp_path, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
     write_cloud(tmp_path / "c.ply", cloud(lambda y, z: np.where(z < 0, 1300.0, 1310.0)))
     arguments = ["measure", str(tmp_path / "c.ply"), "--out", str(tmp_path / "c.png")]
     done = CliRunner().invoke(main, arguments)
