@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from operator import sub
 from typing import NamedTuple
@@ -72,7 +73,10 @@ class ScanReport:
         """Return the losses and warnings, or the cause of an empty scan; else ``""``."""
         notes = []
         if self.points_without_stage:
-            notes.append(f"{self.points_without_stage} points had no stage position")
+            notes.append(
+                f"{self.points_without_stage} points had no stage position; check that stage/odom "
+                "goes on, with stamps of the camera's clock"
+            )
         if self.points_over_limit:
             notes.append(f"{self.points_over_limit} points were over the scan's limit")
         if not notes and not len(self.scan.points):
@@ -111,7 +115,6 @@ class _Counts(NamedTuple):
     packets: int
     packets_lost: int
     events_dropped: int
-    points_without_stage: int
 
 
 class Pipeline:
@@ -145,8 +148,9 @@ class Pipeline:
         self._fresh: list[TimedProfiles] = []
         self._buffer: ScanBuffer | None = None
         self._recorder: ScanRecorder | None = None
+        self._closed_s = math.inf
         self._coverage = SweepCoverage(0.0, 0.0)
-        self._counts_at_begin = _Counts(0, 0, 0, 0, 0)
+        self._counts_at_begin = _Counts(0, 0, 0, 0)
 
     @property
     def scan_id(self) -> str:
@@ -230,7 +234,10 @@ class Pipeline:
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
         # What still waits for a stage position is of before the scan.
-        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm, self.stream.processed_until_ns)
+        since_ns = self.stream.processed_until_ns
+        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm, since_ns)
+        self.placer.begin_scan(since_ns)
+        self._closed_s = math.inf
         self._coverage = SweepCoverage(start_mm, stop_mm, passes)
         self._recorder = recorder
         if recorder is not None and self.placer.track.last_us is not None:
@@ -263,16 +270,18 @@ class Pipeline:
                 + "begin it first"
             )
         self._receive(self.stream.flush(), now_s)
+        self._closed_s = now_s
         self.stream.end_recording()
 
     def end_scan(self) -> ScanReport:
-        """Return the scan that was collected.
+        """Return the scan that was collected; what still waits for the stage is lost.
 
         Points are placed again, by the clock as fitted to the entire sweep, and less the lag that
         passes forth and back show.
         """
         assert self._buffer is not None
         buffer, self._buffer = self._buffer, None
+        self.placer.discard(self._closed_s)
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
         where = scan.points, scan.stamp_ns // NS_PER_US, self.placer.track
@@ -285,6 +294,7 @@ class Pipeline:
         return ScanReport(
             scan,
             **counts._asdict(),
+            points_without_stage=self.placer.points_without_stage_of_scan,
             points_outside=buffer.points_outside,
             points_over_limit=buffer.points_over_limit,
             profiles_expected=self._coverage.profiles(self.stream.profile_rate_hz),
@@ -335,5 +345,4 @@ class Pipeline:
             packets=self.stream.packets,
             packets_lost=self.stream.packets_lost,
             events_dropped=counters["events_dropped"],
-            points_without_stage=self.placer.points_without_stage,
         )

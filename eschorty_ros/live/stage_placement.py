@@ -30,6 +30,7 @@ class StagePlacer:
 
     Public attributes:
     - ``points_without_stage``: Points discarded because no position covers their time.
+    - ``points_without_stage_of_scan``: Those of periods since :meth:`begin_scan`.
     - ``waiting``: Points that wait for a stage position.
     - ``track_restarts``: Restarts of the odometry because its stamps went back: the clock was set,
       or a recording is played again.
@@ -39,7 +40,9 @@ class StagePlacer:
     def __init__(self, gap_s: float, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self.points_without_stage = 0
+        self.points_without_stage_of_scan = 0
         self.waiting = 0
+        self._since_ns: int | None = None
         self.track_restarts = 0
         self._late_before = 0
         self._sampled: tuple[int, float] | None = None
@@ -73,6 +76,10 @@ class StagePlacer:
             self._waiting.append((now_s, timed))
             self.waiting += len(timed.profiles)
 
+    def begin_scan(self, since_ns: int | None) -> None:
+        """Count the losses of a scan: of periods that begin from this ROS time on, or of all."""
+        self.points_without_stage_of_scan, self._since_ns = 0, since_ns
+
     def holds(self, until_s: float) -> bool:
         """Return whether a profile that arrived by ``until_s`` of the steady clock waits.
 
@@ -102,11 +109,29 @@ class StagePlacer:
             timed = waiting.retimed()
             position_mm = self.track.position_mm(timed.t_ns // NS_PER_US)
             known = ~np.isnan(position_mm)
-            self.points_without_stage += int(np.count_nonzero(~known))
+            self._lose(timed, ~known)
             if known.all():
                 placed.append((timed, position_mm))
             elif known.any():
                 placed.append((timed.select(known), position_mm[known]))
+        self._leave(left)
+        return placed
+
+    def discard(self, until_s: float) -> None:
+        """Discard and count the profiles that arrived by ``until_s`` and wait."""
+        left: deque[tuple[float, TimedProfiles]] = deque()
+        for arrived_s, waiting in self._waiting:
+            if arrived_s <= until_s:
+                self._lose(waiting.retimed(), np.ones(len(waiting.profiles), bool))
+            else:
+                left.append((arrived_s, waiting))
+        self._leave(left)
+
+    def _lose(self, timed: TimedProfiles, lost: NDArray[np.bool_]) -> None:
+        self.points_without_stage += int(np.count_nonzero(lost))
+        of_scan = lost if self._since_ns is None else lost & (timed.edge_ns >= self._since_ns)
+        self.points_without_stage_of_scan += int(np.count_nonzero(of_scan))
+
+    def _leave(self, left: deque[tuple[float, TimedProfiles]]) -> None:
         self._waiting = left
         self.waiting = sum(len(timed.profiles) for _, timed in left)
-        return placed

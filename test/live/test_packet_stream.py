@@ -479,6 +479,63 @@ def test_profiles_that_wait_for_the_stage_as_a_scan_begins_are_not_of_it():
     assert 0 < len(report.scan.points) == len(plain(data)) - report.points_outside
 
 
+def scanned(pipeline, scan_id, begin_us, odometry_us, stamp_ns=None):
+    """Return the report of a scan of 114 ms whose odometry lasts for a time; all times shifted."""
+    now_s, begin_ns = begin_us * 1e-3, ZERO_NS + begin_us * 1000
+    pipeline.begin_scan(scan_id, 0.0, 1.0)
+    for packet in packets(line(offset_us=begin_us), seq=begin_us):
+        pipeline.add_packet(packet, now_s)
+    pipeline.process(now_s)
+    for after_us in range(0, odometry_us + 1, 10_000):
+        at_ns = begin_ns + after_us * 1000 if stamp_ns is None else stamp_ns
+        pipeline.add_stage(at_ns, 0.5)
+    pipeline.close_period(scan_id, now_s + 1.0)
+    pipeline.place(now_s + 1.0)
+    pipeline.place(now_s + 5.0)
+    assert not pipeline.placer.holds(now_s + 1.0)
+    return pipeline.end_scan()
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 0])
+def test_points_that_wait_for_the_stage_at_the_end_are_losses_of_their_scan_alone(stamp_ns):
+    pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 10.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+    cut = scanned(pipeline, "cut", 0, 50_000, stamp_ns)
+    assert cut.points_without_stage > 1000, "seed 3"
+    assert cut.points_without_stage + len(cut.scan.points) == len(plain(line()))
+    assert "points had no stage position; check that stage/odom goes on" in cut.message
+    assert cut.completeness < 0.9
+    assert pipeline.placer.points_without_stage == cut.points_without_stage
+    whole = scanned(pipeline, "whole", 200_000, 200_000)
+    assert len(whole.scan.points) > 5000
+    assert (whole.points_without_stage, pipeline.placer.waiting) == (0, 0)
+
+
+def test_points_of_before_a_scan_that_the_stage_never_covers_are_no_losses_of_it():
+    pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 10.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+    for packet in packets(line()):
+        pipeline.add_packet(packet, 95.0)
+    pipeline.process(95.0)
+    waiting = pipeline.placer.waiting
+    assert waiting > 5000, "seed 3"
+    pipeline.begin_scan("s", 0.0, 1.0)
+    for packet in packets(line(offset_us=200_000), seq=1000):
+        pipeline.add_packet(packet, 101.0)
+    pipeline.process(101.0)
+    # The stage's first sample is after the first run: that has no position.
+    for at_ns in (200_000_000, 400_000_000):
+        pipeline.add_stage(ZERO_NS + at_ns, 0.5)
+    pipeline.close_period("s", 102.0)
+    pipeline.place(106.0)
+    report = pipeline.end_scan()
+    assert pipeline.placer.points_without_stage >= waiting
+    assert len(report.scan.points) > 5000
+    assert report.points_without_stage == 0
+
+
 def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
     pipeline = Pipeline(CALIBRATION, Settings(line_width_px=6.0), 1.0, 0.0, 6.0)
     pipeline.stream.announce_zero(ZERO_NS)
