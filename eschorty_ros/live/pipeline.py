@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import (
@@ -37,7 +37,10 @@ _STAGE_BEFORE_US = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
-    """An assembled scan, the losses while it was collected, and the stream's ``warnings``."""
+    """An assembled scan, the losses while it was collected, and the stream's ``warnings``.
+
+    ``refusal`` is the reason why the last of ``packets_refused`` was refused.
+    """
 
     scan: AssembledScan
     events: int
@@ -51,6 +54,8 @@ class ScanReport:
     frequency_hz: float
     warnings: tuple[str, ...] = ()
     pass_lag: PassLag | None = None
+    packets_refused: int = 0
+    refusal: str = ""
 
     @property
     def completeness(self) -> float:
@@ -79,8 +84,11 @@ class ScanReport:
             )
         if self.points_over_limit:
             notes.append(f"{self.points_over_limit} points were over the scan's limit")
-        if not notes and not len(self.scan.points):
+        refused = self.packets_refused and not self.events
+        if not notes and not len(self.scan.points) and not refused:
             notes.append(self._cause_of_empty())
+        if self.packets_refused:
+            notes.append(f"{self.packets_refused} packets were refused, the last: {self.refusal}")
         if self.packets_lost:
             notes.append(f"{self.packets_lost} packets were lost")
         if 0 < self.scan.profiles < COMPLETE * self.profiles_expected:
@@ -115,6 +123,7 @@ class _Counts(NamedTuple):
     packets: int
     packets_lost: int
     events_dropped: int
+    packets_refused: int
 
 
 class Pipeline:
@@ -126,6 +135,7 @@ class Pipeline:
     Public attributes:
     - ``calibration``: That of packets processed from now on.
     - ``stream``, ``placer``: The packet stream and the stage placement.
+    - ``packets_refused``: Packets that were refused as a whole.
     - ``profiles``, ``points``: Numbers of profiles completed and of points placed.
     - ``capture``: Receives a calibration's events and placed profiles while it is set.
     """
@@ -142,6 +152,8 @@ class Pipeline:
         self.calibration = calibration
         self.stream = PacketStream(calibration, settings, clock_timeout_s, packet_period_s)
         self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
+        self.packets_refused = 0
+        self._refusal = ""
         self.profiles = 0
         self.points = 0
         self.capture: Capture | None = None
@@ -150,7 +162,7 @@ class Pipeline:
         self._recorder: ScanRecorder | None = None
         self._closed_s = math.inf
         self._coverage = SweepCoverage(0.0, 0.0)
-        self._counts_at_begin = _Counts(0, 0, 0, 0)
+        self._counts_at_begin = _Counts(0, 0, 0, 0, 0)
 
     @property
     def scan_id(self) -> str:
@@ -162,10 +174,19 @@ class Pipeline:
 
         Raises ``FormatError`` for a packet without the time of a camera.
         """
-        check_span(packet.data)
+        try:
+            check_span(packet.data)
+        except FormatError as error:
+            self.note_refused(str(error))
+            raise
         self.stream.add(packet, now_s)
         if self.capture is not None:
             self.capture.packet(packet)
+
+    def note_refused(self, reason: str) -> None:
+        """Count a packet that was refused, for the report of the scan."""
+        self.packets_refused += 1
+        self._refusal = reason
 
     def process(self, now_s: float) -> None:
         """Reconstruct the packets that need not wait."""
@@ -301,6 +322,7 @@ class Pipeline:
             frequency_hz=self.stream.frequency_hz,
             warnings=tuple(self.stream.warnings),
             pass_lag=lag,
+            refusal=self._refusal,
         )
 
     def end_recording(self, points: Points | None, reason: str = "") -> None:
@@ -345,4 +367,5 @@ class Pipeline:
             packets=self.stream.packets,
             packets_lost=self.stream.packets_lost,
             events_dropped=counters["events_dropped"],
+            packets_refused=self.packets_refused,
         )

@@ -536,6 +536,27 @@ def test_points_of_before_a_scan_that_the_stage_never_covers_are_no_losses_of_it
     assert report.points_without_stage == 0
 
 
+@pytest.mark.parametrize("some_pass", [False, True])
+def test_the_report_of_a_scan_has_the_reason_of_refused_packets(some_pass):
+    pipeline = Pipeline(CALIBRATION, Settings(), 1.0, 0.0, 6.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+    pipeline.note_refused("of before the scan")
+    pipeline.begin_scan("s", 0.0, 1.0)
+    for packet in packets(line()) if some_pass else ():
+        pipeline.add_packet(packet, 0.0)
+    pipeline.process(0.0)
+    pipeline.note_refused("encoding is evt2; set the camera to evt3")
+    with pytest.raises(FormatError):
+        pipeline.add_packet(Packet(99, ZERO_NS, np.random.default_rng(5).bytes(100_000)), 0.0)
+    report = ended(pipeline)
+    assert "2 packets were refused, the last: a packet of 100000 bytes spans" in report.message, (
+        "seeds 3, 5"
+    )
+    assert "no events came" not in report.message
+    assert bool(len(report.scan.points)) == some_pass
+
+
 def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
     pipeline = Pipeline(CALIBRATION, Settings(line_width_px=6.0), 1.0, 0.0, 6.0)
     pipeline.stream.announce_zero(ZERO_NS)

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import TimeReference
 from tf2_msgs.msg import TFMessage
 
-from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.core.storage import ScanLog
@@ -208,7 +208,11 @@ class ReconstructionNode(Node):
     # Callbacks: queue and return.
 
     def _on_packet(self, message: bytes, info: Mapping[str, Any]) -> None:
-        packet = packet_from_message(message, self._camera.check(info), self.calibration)
+        try:
+            packet = packet_from_message(message, self._camera.check(info), self.calibration)
+        except EschortyError as error:
+            self._jobs.post_later(partial(self._pipeline.note_refused, str(error)))
+            raise
         self._reports.packet_ages.add(age_s(self, info, packet.stamp_ns))
         self._jobs.post_bulk(partial(self._add_packet, packet))
 

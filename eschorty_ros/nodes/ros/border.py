@@ -23,21 +23,27 @@ class Refusals:
     """Messages of a node that were refused, and errors of its callbacks: counted and logged.
 
     The log has one line per name every 5 s.
+
+    Public attributes:
+    - ``counts``: Their numbers by name.
+    - ``last``: Name and reason of the last one.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._logged_s: dict[str, float] = {}
         self.counts: Counter[str] = Counter()
+        self.last = ""
 
     def add(self, name: str, reason: str) -> None:
         """Count what came by ``name``; log the reason when that is due."""
         self.counts[name] += 1
+        self.last = f"{name}: {reason[:_LINE_MAX]}"
         now_s = time.monotonic()
         if now_s - self._logged_s.get(name, -math.inf) < _LOG_S:
             return
         self._logged_s[name] = now_s
-        self._node.get_logger().error(f"{name}: {reason[:_LINE_MAX]} ({self.counts[name]} so far)")
+        self._node.get_logger().error(f"{self.last} ({self.counts[name]} so far)")
 
     def values(self) -> dict[str, int]:
         """Return the counts for ``/diagnostics``."""

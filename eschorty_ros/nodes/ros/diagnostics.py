@@ -61,8 +61,11 @@ class Diagnostics:
         level, message, values = self._report()
         refused = refusals(self._node)
         total = refused.counts.total()
-        if total != self._refused and level == OK:
-            level, message = WARN, f"{message}; messages were refused in the last second"
+        if fresh := total - self._refused:
+            level = max(level, WARN)
+            message += (
+                f"; {fresh} messages were refused in the last second, the last of {refused.last}"
+            )
         self._refused = total
         values = {**values, **refused.values()}
         waiting = getattr(self._node, "waiting", "")
