@@ -33,13 +33,16 @@ from eschorty_ros.live.sweep_coverage import COMPLETE, SweepCoverage
 
 # Packets wait for the camera's clock and for the worker; a recording begins with one of these.
 _STAGE_BEFORE_US = 10_000_000
+# Profiles over those that there can be, as a factor and a number, that the ends explain.
+_SURPLUS, _ENDS = 1.05, 3
 
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
     """An assembled scan, the losses while it was collected, and the stream's ``warnings``.
 
-    ``refusal`` is the reason why the last of ``packets_refused`` was refused.
+    ``refusal`` is the reason why the last of ``packets_refused`` was refused. ``profiles_max`` is
+    the number that the stage's time between start and stop allows, with rests.
     """
 
     scan: AssembledScan
@@ -56,17 +59,20 @@ class ScanReport:
     pass_lag: PassLag | None = None
     packets_refused: int = 0
     refusal: str = ""
+    profiles_max: int = 0
 
     @property
     def completeness(self) -> float:
         """Return the least share of what there should be: of profiles, packets and points.
 
-        It is 0 without points.
+        It is 0 without points. Of too many profiles the share is that of those that can be.
         """
         points = len(self.scan.points)
         if not points:
             return 0.0
         lost = self.points_without_stage + self.points_over_limit
+        if self._surplus:
+            return self._profiles_possible / self.scan.profiles
         return min(
             _share(self.scan.profiles, self.profiles_expected),
             _share(self.packets, self.packets + self.packets_lost),
@@ -96,9 +102,23 @@ class ScanReport:
                 f"{self.scan.profiles} profiles of {self.profiles_expected} between start and "
                 f"stop; {self.points_outside} points are outside"
             )
+        if self._surplus:
+            notes.append(
+                f"{self.scan.profiles} profiles of {self._profiles_possible} between start and "
+                "stop, more than there can be; check the stamps of camera/events and stage/odom"
+            )
         if len(self.scan.points):
             notes += self.warnings
         return "; ".join(notes)
+
+    @property
+    def _profiles_possible(self) -> int:
+        return max(self.profiles_expected, self.profiles_max)
+
+    @property
+    def _surplus(self) -> bool:
+        most = _SURPLUS * self._profiles_possible + _ENDS
+        return self.profiles_expected > 0 and self.scan.profiles > most
 
     def _cause_of_empty(self) -> str:
         if not (self.events and self.points_outside):
@@ -323,6 +343,7 @@ class Pipeline:
             warnings=tuple(self.stream.warnings),
             pass_lag=lag,
             refusal=self._refusal,
+            profiles_max=self._coverage.profiles_max(self.stream.profile_rate_hz),
         )
 
     def end_recording(self, points: Points | None, reason: str = "") -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 PASSES_MAX = 255
@@ -21,17 +23,28 @@ class SweepCoverage:
         self._low_mm, self._high_mm = min(start_mm, stop_mm), max(start_mm, stop_mm)
         self._last: tuple[int, float] | None = None
         self._steps: list[tuple[float, float]] = []
+        self._inside_s = 0.0
 
     def add(self, t_ns: int, position_mm: float) -> None:
         """Add a stage sample at ROS time ``t_ns``."""
         before, self._last = self._last, (t_ns, position_mm)
-        if before is None or t_ns <= before[0] or position_mm == before[1]:
+        if before is None or t_ns <= before[0]:
+            return
+        if position_mm == before[1]:
+            self._inside_s += (
+                (t_ns - before[0]) * 1e-9 * (self._low_mm <= position_mm <= self._high_mm)
+            )
             return
         ends_mm = np.clip((before[1], position_mm), self._low_mm, self._high_mm)
         inside_mm = abs(float(ends_mm[1] - ends_mm[0]))
         if inside_mm > 0.0:
-            share = inside_mm / abs(position_mm - before[1])
-            self._steps.append(((t_ns - before[0]) * 1e-9 * share, inside_mm))
+            inside_s = (t_ns - before[0]) * 1e-9 * inside_mm / abs(position_mm - before[1])
+            self._inside_s += inside_s
+            self._steps.append((inside_s, inside_mm))
+
+    def profiles_max(self, profile_rate_hz: float) -> int:
+        """Return the profiles that the time between the positions allows, with rests."""
+        return math.ceil(self._inside_s * profile_rate_hz)
 
     def profiles(self, profile_rate_hz: float) -> int:
         """Return the whole profiles of all passes over the whole distance, 0 without motion.

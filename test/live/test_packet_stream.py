@@ -557,6 +557,28 @@ def test_the_report_of_a_scan_has_the_reason_of_refused_packets(some_pass):
     assert bool(len(report.scan.points)) == some_pass
 
 
+@pytest.mark.parametrize("streams", [1, 3])
+def test_a_scan_with_more_profiles_than_its_time_allows_is_not_complete(streams):
+    """A wrong clock puts events of several times at one time."""
+    pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 6.0)
+    pipeline.begin_scan("s", 0.0, 1.0)
+    for k in range(streams):
+        zero_ns = ZERO_NS + k * 4_000_000
+        pipeline.stream.announce_zero(zero_ns)
+        pipeline.stream.set_laser(MODULATION, zero_ns + EDGE_US * 1000)
+        for packet in packets(line()):
+            pipeline.add_packet(packet, 0.0)
+        pipeline.process(0.0)
+    for k in range(-2, 15):
+        pipeline.add_stage(ZERO_NS + k * 10_000_000, 0.01 + k / 12.0)
+    pipeline.close_period("s", 0.0)
+    pipeline.place(0.0)
+    report = pipeline.end_scan()
+    print(f"seed 3: {report.scan.profiles} of {report.profiles_expected}")
+    assert (report.completeness < 0.9) == (streams > 1)
+    assert ("more than there can be" in report.message) == (streams > 1)
+
+
 def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
     pipeline = Pipeline(CALIBRATION, Settings(line_width_px=6.0), 1.0, 0.0, 6.0)
     pipeline.stream.announce_zero(ZERO_NS)

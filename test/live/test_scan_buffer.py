@@ -92,6 +92,20 @@ def test_a_scan_without_points_has_the_reason(points, events, without, outside, 
     assert (report.completeness > 0.0) == bool(points)
 
 
+@pytest.mark.parametrize(
+    ("profiles", "possible", "surplus"),
+    [(97, 100, False), (104, 100, False), (190, 200, False), (190, 100, True), (120, 100, True)],
+)
+def test_more_profiles_than_the_stages_time_allows_are_named(profiles, possible, surplus):
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    buffer.add(placed([0.5] * profiles, T0_NS + 1_000_000 * np.arange(profiles), range(profiles)))
+    counts = 1000, 1, 0, 0, 0, 0, 0, 97
+    report = ScanReport(buffer.assemble(), *counts, 70.0, profiles_max=possible)
+    assert (report.completeness < 0.9) == surplus
+    assert (f"{profiles} profiles of 100 between start and stop, more" in report.message) == surplus
+    assert bool(report.message) == surplus
+
+
 def test_points_of_before_the_scan_are_left_out_and_counted():
     buffer = ScanBuffer("a", 0.0, 1.0, since_ns=T0_NS)
     buffer.add(placed([0.5, 0.5, 0.5], [T0_NS - 1, T0_NS, T0_NS + 1], [1, 2, 3]))

@@ -43,3 +43,13 @@ def test_a_late_sample_does_not_count():
 
 def test_no_motion_gives_no_profiles():
     assert swept([30.0] * 50) == swept([]) == 0
+
+
+def test_the_most_profiles_are_those_of_the_time_inside_with_rests():
+    coverage = SweepCoverage(20.0, 40.0)
+    rests = [10.0] * 100, np.arange(10.0, 30.0, 0.5), [30.0] * 101, np.arange(30.5, 50.0, 0.5)
+    for k, position_mm in enumerate(np.concatenate(rests)):
+        coverage.add(k * 10_000_000, float(position_mm))
+    # 0.4 s of motion and 1 s of rest.
+    assert coverage.profiles_max(70.0) == pytest.approx(1.4 * 70, abs=1)
+    assert coverage.profiles(70.0) == 27
