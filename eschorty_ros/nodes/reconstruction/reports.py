@@ -90,8 +90,9 @@ class Reports:
         }
         if self.faults:
             return diagnostics.ERROR, "internal errors; see the log", values
-        if stream.held:
-            return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
+        # Read once: meanwhile the worker may take the packets.
+        if waits_for := stream.waits_for if stream.held else "":
+            return diagnostics.WARN, f"packets wait for the {waits_for}", values
         if stream.epoch is not None and stream.epoch.edges_missing:
             return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
         if warnings := [*self._new_losses(), *stream.warnings]:

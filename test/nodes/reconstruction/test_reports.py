@@ -65,3 +65,14 @@ def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.0)
     assert reports.diagnose()[:2] == (diagnostics.WARN, "no packets yet")
     assert "no packets on camera/events" in logged[0]
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_packets_that_wait_have_a_line_unless_the_worker_takes_them_meanwhile(monkeypatch, taken):
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    pipeline.stream.add(Packet(0, 0, b""), 0.0)
+    if taken:
+        monkeypatch.setattr(type(pipeline.stream), "waits_for", "")
+    node = SimpleNamespace(create_publisher=lambda *_: None)
+    line = Reports(node, pipeline, JobQueue(1)).diagnose()[1]
+    assert line == ("no packets yet" if taken else "packets wait for the modulation")
