@@ -59,7 +59,7 @@ class PacketStream:
     - ``packets_late``: Packets left out because they came twice or after later ones;
       ``packets_lost`` includes the latter.
     - ``clock_restarts``: Restarts of the clock because stamps or sensor times went back, or
-      contradict each other.
+      contradict each other, or the computer's clock was set.
     - ``announcements_refused``: Announced zeros that contradict the packets' stamps, which serve
       instead.
     - ``announcement_expected``: True while packets wait for an announcement of the camera's zero.
@@ -187,6 +187,14 @@ class PacketStream:
     def forget_zero(self) -> None:
         """Forget an announced zero before the next scan: its sender has ended."""
         self._zero_ended = True
+
+    def restart_clock(self) -> None:
+        """Fit the clock to the stamps that come now: those so far are of another time."""
+        if self._epoch is not None and not self._epoch.clock.exact:
+            self._begin_epoch(SensorClock())
+            self.clock_restarts += 1
+            if self._reconstructor is not None:
+                self._reconstructor.set_modulation(self._modulation())
 
     def begin_scan(self, recorder: ScanRecorder | None = None) -> None:
         """Drop the state that senders have left behind; record the packets from here on."""

@@ -42,7 +42,8 @@ class ScanReport:
     """An assembled scan, the losses while it was collected, and the stream's ``warnings``.
 
     ``refusal`` is the reason why the last of ``packets_refused`` was refused. ``profiles_max`` is
-    the number that the stage's time between start and stop allows, with rests.
+    the number that the stage's time between start and stop allows, with rests; ``clock_step_ns``
+    is how far the computer's clock was set meanwhile.
     """
 
     scan: AssembledScan
@@ -60,15 +61,17 @@ class ScanReport:
     packets_refused: int = 0
     refusal: str = ""
     profiles_max: int = 0
+    clock_step_ns: int = 0
 
     @property
     def completeness(self) -> float:
         """Return the least share of what there should be: of profiles, packets and points.
 
-        It is 0 without points. Of too many profiles the share is that of those that can be.
+        It is 0 without points, and where the clock was set, which shifts them. Of too many profiles
+        the share is that of those that can be.
         """
         points = len(self.scan.points)
-        if not points:
+        if not points or self.clock_step_ns:
             return 0.0
         lost = self.points_without_stage + self.points_over_limit
         if self._surplus:
@@ -83,6 +86,11 @@ class ScanReport:
     def message(self) -> str:
         """Return the losses and warnings, or the cause of an empty scan; else ``""``."""
         notes = []
+        if self.clock_step_ns:
+            notes.append(
+                f"the computer's clock was set by {self.clock_step_ns * 1e-9:+.3f} s, which shifts "
+                "points along the sweep; scan again"
+            )
         if self.points_without_stage:
             notes.append(
                 f"{self.points_without_stage} points had no stage position; check that stage/odom "
@@ -181,6 +189,7 @@ class Pipeline:
         self._buffer: ScanBuffer | None = None
         self._recorder: ScanRecorder | None = None
         self._closed_s = math.inf
+        self._clock_step_ns = 0
         self._coverage = SweepCoverage(0.0, 0.0)
         self._counts_at_begin = _Counts(0, 0, 0, 0, 0)
 
@@ -219,6 +228,11 @@ class Pipeline:
             self._coverage.add(t_ns, position_mm)
         if self._recorder is not None:
             self._recorder.stage(t_ns, position_mm)
+
+    def follow_clock(self, step_ns: int) -> None:
+        """Start the camera's clock again: the computer's was set by this much."""
+        self.stream.restart_clock()
+        self._clock_step_ns = step_ns
 
     def complete(self, now_s: float) -> list[TimedProfiles]:
         """Return the profiles completed since the last call."""
@@ -279,6 +293,7 @@ class Pipeline:
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm, since_ns)
         self.placer.begin_scan(since_ns)
         self._closed_s = math.inf
+        self._clock_step_ns = 0
         self._coverage = SweepCoverage(start_mm, stop_mm, passes)
         self._recorder = recorder
         if recorder is not None and self.placer.track.last_us is not None:
@@ -344,6 +359,7 @@ class Pipeline:
             pass_lag=lag,
             refusal=self._refusal,
             profiles_max=self._coverage.profiles_max(self.stream.profile_rate_hz),
+            clock_step_ns=self._clock_step_ns,
         )
 
     def end_recording(self, points: Points | None, reason: str = "") -> None:

@@ -14,6 +14,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live import packet_stream
+from eschorty_ros.live.clock_steps import ClockSteps
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import Packet, check_span, first_time_us
 from eschorty_ros.live.pipeline import Pipeline
@@ -355,6 +356,39 @@ def test_points_move_with_the_clock_until_they_are_placed():
     moved_ns = parts[0].retimed().t_ns - before_ns
     assert np.ptp(moved_ns) <= 1000
     assert -3_050_000_000 < moved_ns[0] < -2_800_000_000
+
+
+def test_points_after_a_clock_set_forward_are_in_its_time_and_a_scan_meanwhile_fails():
+    pipeline = Pipeline(CALIBRATION, Settings(), 0.0, 1.0, 10.0)
+    pipeline.stream.announcement_expected = False
+    pipeline.stream.set_laser(MODULATION, None)
+    steps, step_ns = ClockSteps(), 100_000_000
+
+    def scan(scan_id, begin_us, set_ns, lead_ns):
+        """Return the report of 8 periods by a clock that leads and is set before the end."""
+        pipeline.begin_scan(scan_id, 0.0, 1.0)
+        for packet in sent(line(offset_us=begin_us), seq=begin_us):
+            pipeline.add_packet(replace(packet, stamp_ns=packet.stamp_ns + lead_ns), 0.0)
+            pipeline.process(0.0)
+        for now_s in (0.0, 0.1, 1.0):
+            seen_ns = steps.step_ns(lead_ns + set_ns * (now_s > 0.0), begin_us * 1e-6 + now_s)
+            if seen_ns:
+                pipeline.follow_clock(seen_ns)
+        for after_us in range(0, 300_000, 10_000):
+            pipeline.add_stage(ZERO_NS + (begin_us + after_us) * 1000 + lead_ns, 0.5)
+        pipeline.close_period(scan_id, 0.0)
+        pipeline.place(0.0)
+        return pipeline.end_scan()
+
+    first = scan("first", 0, step_ns, 0)
+    assert pipeline.stream.clock_restarts == 2
+    assert first.completeness == 0.0
+    assert "the computer's clock was set by +0.100 s, which shifts points" in first.message
+    second = scan("second", 2_000_000, 0, step_ns)
+    assert "clock" not in second.message
+    assert len(second.scan.points) > 5000
+    late_ns = second.scan.stamp_ns - (ZERO_NS + 2_000_000_000 + step_ns)
+    assert abs(late_ns) < 5_000_000
 
 
 def test_a_clock_set_back_starts_an_epoch_and_leaves_old_points_alone():

@@ -23,6 +23,7 @@ from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.live.calibration_capture import Capture
+from eschorty_ros.live.clock_steps import ClockSteps
 from eschorty_ros.live.device_messages import laser_settings, ns_from_stamp, pulse_train
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
@@ -64,6 +65,8 @@ _JOBS_PER_STEP = 32
 _STEP_S = 0.004
 # Loading the compiled kernels takes less.
 _COMPILING_S = 5.0
+# Longest time between two clocks that are read together.
+_READ_NS = 1_000_000
 _COMPILING = "compiling kernels, for some minutes at a first start; 'eschorty compile' does it"
 
 
@@ -104,6 +107,7 @@ class ReconstructionNode(Node):
         self._outputs = Outputs(
             self, self.calibration, self.parameters["profile_rate_max"], self._frames
         )
+        self._clock_steps = ClockSteps()
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
         self._camera_roi = CameraRoi(self, self.parameters["camera_roi"] == "follow")
@@ -329,7 +333,23 @@ class ReconstructionNode(Node):
         pipeline = self._pipeline
         return bool(pipeline.stream.held or pipeline.placer.waiting or self._outputs.waits)
 
+    def _follow_clock(self) -> None:
+        """Compare the computer's clock with the steady one, unless ROS time is simulated."""
+        before_ns = time.monotonic_ns()
+        lead_ns = time.time_ns() - before_ns
+        # Otherwise the process stalled between the two.
+        if time.monotonic_ns() - before_ns > _READ_NS:
+            return
+        step_ns = self._clock_steps.step_ns(lead_ns, before_ns * 1e-9)
+        if step_ns and not self.get_parameter("use_sim_time").value:
+            self._pipeline.follow_clock(step_ns)
+            self.get_logger().warning(
+                f"the clock was set by {step_ns * 1e-9:+.3f} s; the camera's starts again",
+                throttle_duration_sec=1.0,
+            )
+
     def _step(self) -> None:
+        self._follow_clock()
         # A profile leaves before its points are placed, which it does not need.
         self._outputs.profiles(self._pipeline.complete(time.monotonic()))
         if self._outputs.points_due:
