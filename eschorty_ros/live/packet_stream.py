@@ -16,11 +16,8 @@ from eschorty_ros.live.light_warnings import LightWarnings
 from eschorty_ros.live.packet_times import (
     GAP_NS,
     Packet,
-    TimeHigh,
     first_time_us,
-    newest_high,
     overtaken,
-    restarts_time,
     skips_time,
 )
 from eschorty_ros.live.scan_recorder import ScanRecorder
@@ -102,7 +99,6 @@ class PacketStream:
         self._next_seq: int | None = None
         self._source = b""
         self._last_stamp_ns = 0
-        self._last_high: TimeHigh | None = None
         self._retired: Counter[str] = Counter()
         self._warnings = LightWarnings()
         self._out: list[TimedProfiles] = []
@@ -315,37 +311,25 @@ class PacketStream:
 
     def _consecutive(self) -> list[Packet]:
         """Remove and return the first packet held and those that continue it without a loss."""
-        packets = [self._take()]
+        packets = [self._held.popleft()]
         while self._held:
             last, packet = packets[-1], self._held[0]
             if (packet.source, packet.seq) != (last.source, last.seq + 1):
                 break
             if packet.stamp_ns - last.stamp_ns > GAP_NS:
                 break
-            if restarts_time(packet, self._last_high, lost=False):
-                break
-            packets.append(self._take())
+            packets.append(self._held.popleft())
         return packets
 
-    def _take(self) -> Packet:
-        packet = self._held.popleft()
-        self._last_high = newest_high(packet, self._last_high)
-        return packet
-
     def _goes_on(self, packet: Packet) -> bool:
-        """Return whether a packet is of the same stream; count a restart of its sensor time."""
         assert self._next_seq is not None
         missing = packet.seq - self._next_seq
-        if packet.source != self._source or not 0 <= missing <= _LOST_MAX:
-            return False
-        restarts = restarts_time(packet, self._last_high, missing > 0)
-        self.clock_restarts += restarts
-        return not restarts
+        return packet.source == self._source and 0 <= missing <= _LOST_MAX
 
     def _forget_stream(self) -> None:
         self._retire()
         self.restarts += 1
-        self._next_seq = self._last_high = None
+        self._next_seq = None
         if self._epoch_used:
             self._epoch = None
 

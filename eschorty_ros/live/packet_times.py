@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.clocks import NS_PER_US
@@ -13,8 +13,6 @@ from eschorty_ros.core.evt3 import WRAP_US, begin_time, first_time_high_us, time
 GAP_NS = WRAP_US * NS_PER_US // 2
 # A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
-# Where packets got lost the host may have stalled, and its stamps be late, by less than this.
-_STALL_US = 2_000_000
 # A packet at most this many numbers back that is stamped no later was overtaken in transit.
 _OVERTAKEN = 16
 # A broken word adds one wrap; a packet holds some milliseconds.
@@ -72,43 +70,6 @@ def skips_time(data: Any, before_us: int | None) -> bool:
     if high_us is None or before_us is None:
         return False
     return _STEP_US < (high_us - (before_us & ~0xFFF)) % WRAP_US < WRAP_US - _STEP_US
-
-
-class TimeHigh(NamedTuple):
-    """Time of a packet's first TIME_HIGH, us modulo the wrap, and the packet's stamp."""
-
-    t_us: int
-    stamp_ns: int
-
-
-def newest_high(packet: Packet, before: TimeHigh | None) -> TimeHigh | None:
-    """Return the first TIME_HIGH of a packet, ``before`` where it has none or a broken one."""
-    high_us = first_time_high_us(packet.data)
-    if high_us is None or (before is not None and _is_broken(packet.data, before.t_us)):
-        return before
-    return TimeHigh(high_us, packet.stamp_ns)
-
-
-def restarts_time(packet: Packet, before: TimeHigh | None, lost: bool) -> bool:
-    """Return whether sensor time starts again with this packet, though its number goes on.
-
-    Sensor time, modulo its wrap, then makes a step that the stamps do not. ``before`` is the last
-    one known, ``lost`` is true where packets are missing since.
-    """
-    if before is None or not skips_time(packet.data, before.t_us):
-        return False
-    if _is_broken(packet.data, before.t_us):
-        return False
-    high_us = first_time_high_us(packet.data)
-    assert high_us is not None
-    step_us = high_us - before.t_us - (packet.stamp_ns - before.stamp_ns) // NS_PER_US
-    apart_us = (step_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
-    return abs(apart_us) > (_STALL_US if lost else _STEP_US)
-
-
-def _is_broken(data: Any, before_us: int) -> bool:
-    """Return whether the first TIME_HIGH is off ``before_us`` and the next one off the first."""
-    return skips_time(data, before_us) and time_span_us(data) > _STEP_US
 
 
 def _first_word_us(data: Any, before_us: int | None) -> int | None:

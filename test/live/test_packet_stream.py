@@ -312,48 +312,6 @@ def test_a_gap_without_numbers_is_told_from_a_host_that_stood_still(gap_us, at_o
 
 
 @AT_ONCE
-@pytest.mark.parametrize("begun_us", [5_000_000, WRAP_US - 1_500_000])
-@pytest.mark.parametrize("pause_us", [200_000, 2_000_000, 12_000_000])
-def test_sensor_time_that_starts_again_while_the_numbers_go_on(begun_us, pause_us, at_once):
-    """A driver that restarts the camera and goes on numbering and stamping."""
-    first = sent(line(offset_us=begun_us))
-    shift_us = begun_us + 115_000 + pause_us
-    later = sent(line(), shift_us, seq=len(first))
-    subject = unannounced()
-    parts = run(subject, [*first, *later], at_once=at_once)
-    assert (subject.restarts, subject.clock_restarts, subject.packets_lost) == (1, 1, 0)
-    alone = unannounced()
-    expected = joined(run(alone, sent(line())))
-    again = [part.retimed() for part in parts if part.sensor.epoch is subject.epoch]
-    np.testing.assert_array_equal(joined(again).row, expected.row)
-    true_ns = ZERO_NS + (joined(again).t_us + shift_us) * 1000
-    assert np.abs(times_ns(again) - true_ns).max() < 5_000_000
-
-
-@AT_ONCE
-def test_a_wrap_and_a_pause_are_no_restart_of_sensor_time(at_once):
-    items = sent(line(offset_us=WRAP_US - 50_000))
-    items += sent(line(offset_us=3_000_000), WRAP_US, seq=len(items))
-    subject = unannounced()
-    run(subject, items, at_once=at_once)
-    assert (subject.restarts, subject.clock_restarts) == (0, 0)
-
-
-@AT_ONCE
-def test_a_broken_time_high_is_no_restart_of_sensor_time(at_once):
-    items = packets(line())
-    words = np.frombuffer(items[3].data, "<u2").copy()
-    high = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
-    assert len(high) > 1
-    words[high[0]] ^= 0x800
-    items[3] = replace(items[3], data=words.tobytes())
-    subject = announced()
-    run(subject, items, at_once=at_once)
-    assert (subject.restarts, subject.clock_restarts) == (0, 0)
-    assert subject.epoch.clock.exact
-
-
-@AT_ONCE
 def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera(at_once):
     items = packets(line(), size=20_000)
     expected = joined(run(announced(), items))
@@ -390,15 +348,14 @@ def test_a_time_low_that_the_sensor_takes_back_does_not_move_the_clock():
 
 def test_points_move_with_the_clock_until_they_are_placed():
     subject = unannounced()
-    late = [Packet(p.seq, p.stamp_ns + 1_500_000_000, p.data) for p in sent(line())]
+    late = [Packet(p.seq, p.stamp_ns + 3_000_000_000, p.data) for p in sent(line())]
     parts = run(subject, late)
     before_ns = parts[0].t_ns.copy()
-    # Some are lost while the host stalls.
-    prompt = sent(line(offset_us=1_500_000), seq=len(late) + 100)
+    prompt = sent(line(offset_us=3_000_000), seq=len(late))
     run(subject, [Packet(p.seq, max(p.stamp_ns, late[-1].stamp_ns), p.data) for p in prompt])
     moved_ns = parts[0].retimed().t_ns - before_ns
     assert np.ptp(moved_ns) <= 1000
-    assert -1_550_000_000 < moved_ns[0] < -1_300_000_000
+    assert -3_050_000_000 < moved_ns[0] < -2_800_000_000
 
 
 def test_points_after_a_clock_set_forward_are_in_its_time_and_a_scan_meanwhile_fails():
