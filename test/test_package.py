@@ -64,7 +64,8 @@ def test_the_oldest_versions_are_those_that_are_tested() -> None:
         for name in ("run.txt", "floor.txt")
     )
     wanted = {line for line in bounds if "==" in line}
-    assert wanted == {line for line in pins if "==" in line}
+    # matplotlib's own, which has no upper bound for it.
+    assert wanted | {"pyparsing==3.1.1"} == {line for line in pins if "==" in line}
 
 
 @pytest.mark.parametrize("name", ["event_camera_msgs", "tf2_msgs"])

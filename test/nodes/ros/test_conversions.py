@@ -23,6 +23,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
     serialized_cloud,
 )
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+from eschorty_ros.nodes.ros.frames import frames
 
 
 @settings(derandomize=True, deadline=None)
@@ -101,7 +102,7 @@ def test_laser_state_without_epoch_leaves_the_phase_unknown():
 
 
 def test_optical_frame_is_a_rotation_with_z_along_the_range_axis():
-    _, optical = transforms.mounts(0)
+    _, optical = transforms.mounts(frames("left_"), 0)
     q = optical.transform.rotation
     rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     assert np.isclose(np.linalg.norm([q.x, q.y, q.z, q.w]), 1.0)
@@ -111,5 +112,7 @@ def test_optical_frame_is_a_rotation_with_z_along_the_range_axis():
 
 
 def test_carriage_moves_along_the_stage_direction():
-    moved = transforms.carriage(5, 100.0, (0.0, 0.8, 0.6)).transform.translation
+    carriage = transforms.carriage(frames("left_"), 5, 100.0, (0.0, 0.8, 0.6))
+    assert (carriage.header.frame_id, carriage.child_frame_id) == ("left_base", "left_stage")
+    moved = carriage.transform.translation
     np.testing.assert_allclose([moved.x, moved.y, moved.z], [0.0, 0.08, 0.06])
