@@ -32,6 +32,7 @@ class Outputs:
     Only the worker thread calls the methods, except the constructor.
 
     - ``profile_rate_max_hz``: Profiles per second of sensor time that are published at most.
+    - ``names``: Those of the frames.
     """
 
     def __init__(
