@@ -180,6 +180,7 @@ class ReconstructionNode(Node):
             self,
             self._pipeline,
             lambda: ("camera/events", "stage/odom", *(() if self._override else ("laser/state",))),
+            self._stage,
             self._in_worker,
             self._running,
             self.parameters["stage_timeout"],

@@ -42,6 +42,7 @@ class ScanServices:
 
     - ``pipeline``: Used by the worker alone.
     - ``topics``: Returns the topics that a scan needs one publisher of.
+    - ``stage``: Checks the publisher of ``stage/odom``, which must not be silent.
     - ``in_worker``: Runs a job in the worker; returns whether it succeeded, and the reason of a
       failure.
     - ``running``: Returns whether the worker runs.
@@ -56,6 +57,7 @@ class ScanServices:
         node: Node,
         pipeline: Pipeline,
         topics: Callable[[], Sequence[str]],
+        stage: OnePublisher,
         in_worker: Callable[[Callable[[], None], float], tuple[bool, str]],
         running: Callable[[], bool],
         stage_timeout_s: float,
@@ -64,6 +66,7 @@ class ScanServices:
         short: CallbackGroup,
     ) -> None:
         self._node, self._pipeline, self._topics = node, pipeline, topics
+        self._stage = stage
         self._in_worker, self._running = in_worker, running
         self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
@@ -144,7 +147,8 @@ class ScanServices:
             self._recorder.wait(_RECORD_S)
 
     def _fault(self) -> str:
-        faults = (publishers_fault(self._node, topic) for topic in self._topics())
+        faults = [publishers_fault(self._node, topic) for topic in self._topics()]
+        faults.append(self._stage.silence_fault(self._node, "stage/odom"))
         return "; ".join(fault for fault in faults if fault)
 
     def _on_heartbeat(self, message: Header, info: Mapping[str, Any]) -> None:

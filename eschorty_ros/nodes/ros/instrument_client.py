@@ -56,6 +56,10 @@ from eschorty_ros.srv import BeginScan, EndScan
 _TICK_LIMIT_S = 1.0
 # Part of the laser's reason when a heartbeat is missing.
 _HEARTBEAT = "/heartbeat"
+# Part of the reconstruction's reason when the odometry has not one publisher that sends.
+_ODOMETRY = "stage/odom"
+# The middleware forgets a node that has been killed within 20 s.
+_DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
 _ASSEMBLE_S = 60.0
 # The reconstruction first works off the packets that a broken link has held back.
@@ -353,11 +357,17 @@ class ScanClient(InstrumentClient):
             passes=request.passes,
         )
         self.monitor.restart_samples(self._now_ns())
-        # A cancel before the answer would leave a scan that is never ended.
+        ends_s = time.monotonic() + _DEAD_S
+        while not (answer := self._begun(begin)).success:
+            # A stage that has been killed counts as a publisher for some time.
+            if _ODOMETRY not in answer.message or time.monotonic() > ends_s:
+                raise ScanFailure(f"reconstruction: {answer.message}")
+            self.tick()
+
+    def _begun(self, begin: Any) -> Any:
+        """Return the answer; a cancel before it would leave a scan that is never ended."""
         with self.shielded():
-            answer = self._call("reconstruction/begin_scan", begin, _BEGIN_S)
-        if not answer.success:
-            raise ScanFailure(f"reconstruction: {answer.message}")
+            return self._call("reconstruction/begin_scan", begin, _BEGIN_S)
 
     def end_scan(self, scan_id: str) -> ScanSummary:
         """Publish the points collected."""

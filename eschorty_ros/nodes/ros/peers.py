@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,6 +18,8 @@ from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _PUBLISHER_TIMEOUT_NS = 250_000_000
 _CHECK_S = 1.0
+# A stage at rest sends 5 times per second.
+_SILENT_S = 1.5
 _NAMES_MAX = 64
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
@@ -27,6 +30,7 @@ class OnePublisher:
     def __init__(self) -> None:
         self._publisher = b""
         self._received_ns: float = -math.inf
+        self._received_s = -math.inf
 
     def check(self, info: Mapping[str, Any]) -> bytes:
         """Return the publisher of the message with this information, ``b""`` where unknown.
@@ -40,7 +44,18 @@ class OnePublisher:
         ):
             raise ArgumentError("another node publishes it, too; stop all but one")
         self._publisher, self._received_ns = publisher, received_ns
+        self._received_s = time.monotonic()
         return publisher
+
+    def silence_fault(self, node: Node, topic: str) -> str:
+        """Return that the publisher is there and sends nothing, ``""`` when it sends or has left.
+
+        One that ended without leaving stays for 10 to 20 s, in which its successor may be unknown.
+        """
+        full, silent_s = node.resolve_topic_name(topic), time.monotonic() - self._received_s
+        if silent_s < _SILENT_S or self._publisher not in _living(node, full):
+            return ""
+        return f"nothing on {full} for {silent_s:.0f} s; look at its node, publish at rest, too"
 
 
 class Publishers:

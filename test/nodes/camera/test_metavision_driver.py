@@ -48,6 +48,12 @@ def recording(tmp_path_factory):
 
 def publish(driver: Driver, observer: Observer, recording, states) -> None:
     """Publish stage and packets; stay a bounded number ahead, as best effort loses a burst."""
+    camera = Node(driver.node, context=observer.node.context)
+    reliability = ReliabilityPolicy[driver.reliability.upper()]
+    events = camera.create_publisher(
+        EventPacket, driver.topic, QoSProfile(depth=1000, reliability=reliability)
+    )
+    wait_until(events.get_subscription_count, "a subscriber of the driver")
     odometry = observer.publisher(Odometry, "/my_stage/odom", qos.stream(2000))
     placed = observer.collect(TFMessage, "/tf", qos.stream())
     zero_ns = observer.node.get_clock().now().nanoseconds
@@ -59,12 +65,6 @@ def publish(driver: Driver, observer: Observer, recording, states) -> None:
     # Before the scan begins: a sweep shorter than the scan is reported as incomplete.
     stamp = message.header.stamp
     wait_until(lambda: placed and placed[-1].transforms[-1].header.stamp == stamp, "the stage")
-    camera = Node(driver.node, context=observer.node.context)
-    reliability = ReliabilityPolicy[driver.reliability.upper()]
-    events = camera.create_publisher(
-        EventPacket, driver.topic, QoSProfile(depth=1000, reliability=reliability)
-    )
-    wait_until(events.get_subscription_count, "a subscriber of the driver")
     request = BeginScan.Request(scan_id="driver", start=0.0, stop=0.22)
     answer = observer.call(BeginScan, "reconstruction/begin_scan", request)
     assert answer.success, answer.message

@@ -6,7 +6,7 @@ import pytest
 
 from eschorty_ros.control.instrument_monitor import InstrumentMonitor
 from eschorty_ros.control.paced_waiting import PacedWaiting
-from eschorty_ros.control.scan_sequence import ScanCanceled, ScanRequest
+from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure, ScanRequest
 from eschorty_ros.nodes.ros.instrument_client import ScanClient
 
 
@@ -25,19 +25,22 @@ class Answered:
 
 
 class CanceledClient(ScanClient):
-    """The client of a goal that is canceled while the reconstruction's answer is on its way."""
+    """The client of a goal that is canceled while the reconstruction's answer is on its way.
 
-    def __init__(self):
+    - ``answers``: Those of the reconstruction; one that begins the scan when omitted.
+    """
+
+    def __init__(self, *answers, canceled=True):
+        answers = list(answers) or [SimpleNamespace(success=True, message="")]
         monitor = InstrumentMonitor(lambda: True)
         PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
         self._service_timeout_s = 5.0
-        answer = SimpleNamespace(success=True, message="")
         self._clients = {
             "reconstruction/begin_scan": SimpleNamespace(
-                call_async=lambda request: Answered(answer, 3)
+                call_async=lambda request: Answered(answers.pop(0), 3)
             )
         }
-        PacedWaiting.prepare(self, lambda: True, lambda phase: None)
+        PacedWaiting.prepare(self, lambda: canceled, lambda phase: None)
 
 
 def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects():
@@ -45,3 +48,16 @@ def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects(
     client.begin_scan(ScanRequest("s", 20.0, 40.0, 50.0, 70.0))
     with pytest.raises(ScanCanceled):
         client.tick()
+
+
+@pytest.mark.parametrize(("topic", "waits"), [("stage/odom", True), ("camera/events", False)])
+def test_a_scan_waits_for_the_odometry_of_a_stage_that_was_started_again(topic, waits):
+    refused = SimpleNamespace(success=False, message=f"/eschorty/{topic} has 2 publishers")
+    taken = SimpleNamespace(success=True, message="")
+    client = CanceledClient(refused, refused, taken, canceled=False)
+    request = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
+    if waits:
+        client.begin_scan(request)
+    else:
+        with pytest.raises(ScanFailure, match="has 2 publishers"):
+            client.begin_scan(request)

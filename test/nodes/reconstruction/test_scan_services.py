@@ -1,0 +1,76 @@
+"""The services around a scan of one's own camera and stage."""
+
+import time
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from eschorty_ros.srv import BeginScan, EndScan
+from event_camera_msgs.msg import EventPacket
+from nav_msgs.msg import Odometry
+from ros_process import NodeProcess, Observer
+from waiting import wait_until
+
+from eschorty_ros.nodes.ros import qos
+
+
+@pytest.fixture(scope="module")
+def devices():
+    """An observer of a reconstruction, and its publishers of events and odometry."""
+    with (
+        Observer() as observer,
+        NodeProcess(
+            "eschorty_ros.nodes.reconstruction.node", {"frequency": 70.0}, domain=observer.domain
+        ),
+    ):
+        events = observer.publisher(EventPacket, "camera/events", qos.events())
+        odometry = observer.publisher(Odometry, "stage/odom", qos.stream())
+        yield observer, events, odometry
+
+
+def begin(observer, scan_id):
+    request = BeginScan.Request(scan_id=scan_id, stop=0.1)
+    return observer.call(BeginScan, "reconstruction/begin_scan", request)
+
+
+def end(observer, scan_id):
+    return observer.call(EndScan, "reconstruction/end_scan", EndScan.Request(scan_id=scan_id))
+
+
+def sample(observer):
+    message = Odometry()
+    message.header.stamp = observer.node.get_clock().now().to_msg()
+    return message
+
+
+def test_a_scan_begins_before_any_odometry_and_not_while_its_publisher_is_silent(devices):
+    observer, _, odometry = devices
+    assert begin(observer, "first").success
+    end(observer, "first")
+    odometry.publish(sample(observer))
+    time.sleep(2.0)
+    refused = begin(observer, "silent")
+    assert not refused.success
+    assert "nothing on /eschorty/stage/odom for" in refused.message
+    odometry.publish(sample(observer))
+    answer = begin(observer, "again")
+    assert answer.success, answer.message
+    end(observer, "again")
+
+
+def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
+    observer, events, odometry = devices
+    odometry.publish(sample(observer))
+    reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+    assert begin(observer, "evt2").success
+    for seq in range(3):
+        events.publish(EventPacket(seq=seq, encoding="evt2", width=1280, height=720))
+    reason = "encoding is 'evt2'; set the camera to evt3"
+    wait_until(
+        lambda: any(
+            f"the last of camera/events: {reason}" in status.message
+            for report in reports
+            for status in report.status
+        ),
+        "the reason in the diagnostics",
+    )
+    assert end(observer, "evt2").message == f"3 packets were refused, the last: {reason}"
