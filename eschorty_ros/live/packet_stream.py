@@ -188,13 +188,18 @@ class PacketStream:
         """Forget an announced zero before the next scan: its sender has ended."""
         self._zero_ended = True
 
-    def restart_clock(self) -> None:
-        """Fit the clock to the stamps that come now: those so far are of another time."""
-        if self._epoch is not None and not self._epoch.clock.exact:
-            self._begin_epoch(SensorClock())
-            self.clock_restarts += 1
-            if self._reconstructor is not None:
-                self._reconstructor.set_modulation(self._modulation())
+    def restart_clock(self) -> bool:
+        """Fit the clock to the stamps that come now, as those so far are of another time.
+
+        Returns whether points move with it: an announced zero stays.
+        """
+        if self._epoch is None or self._epoch.clock.exact:
+            return False
+        self._begin_epoch(SensorClock())
+        self.clock_restarts += 1
+        if self._reconstructor is not None:
+            self._reconstructor.set_modulation(self._modulation())
+        return True
 
     def begin_scan(self, recorder: ScanRecorder | None = None) -> None:
         """Drop the state that senders have left behind; record the packets from here on."""

@@ -229,10 +229,12 @@ class Pipeline:
         if self._recorder is not None:
             self._recorder.stage(t_ns, position_mm)
 
-    def follow_clock(self, step_ns: int) -> None:
-        """Start the camera's clock again: the computer's was set by this much."""
-        self.stream.restart_clock()
-        self._clock_step_ns = step_ns
+    def follow_clock(self, step_ns: int) -> bool:
+        """Return whether the camera's clock starts again as the computer's was set by this much."""
+        restarted = self.stream.restart_clock()
+        if restarted:
+            self._clock_step_ns = step_ns
+        return restarted
 
     def complete(self, now_s: float) -> list[TimedProfiles]:
         """Return the profiles completed since the last call."""

@@ -391,6 +391,21 @@ def test_points_after_a_clock_set_forward_are_in_its_time_and_a_scan_meanwhile_f
     assert abs(late_ns) < 5_000_000
 
 
+def test_an_announced_clock_stays_when_the_computers_is_set():
+    pipeline = Pipeline(CALIBRATION, Settings(), 0.0, 1.0, 10.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, None)
+    pipeline.begin_scan("replayed", 0.0, 1.0)
+    for packet in sent(line()):
+        pipeline.add_packet(packet, 0.0)
+    pipeline.process(0.0)
+    assert not pipeline.follow_clock(100_000_000)
+    pipeline.close_period("replayed", 0.0)
+    report = pipeline.end_scan()
+    assert pipeline.stream.clock_restarts == 0
+    assert "clock was set" not in report.message
+
+
 def test_a_clock_set_back_starts_an_epoch_and_leaves_old_points_alone():
     subject = unannounced()
     items = sent(line())

@@ -342,8 +342,9 @@ class ReconstructionNode(Node):
         if time.monotonic_ns() - before_ns > _READ_NS:
             return
         step_ns = self._clock_steps.step_ns(lead_ns, before_ns * 1e-9)
-        if step_ns and not self.get_parameter("use_sim_time").value:
-            self._pipeline.follow_clock(step_ns)
+        if not step_ns or self.get_parameter("use_sim_time").value:
+            return
+        if self._pipeline.follow_clock(step_ns):
             self.get_logger().warning(
                 f"the clock was set by {step_ns * 1e-9:+.3f} s; the camera's starts again",
                 throttle_duration_sec=1.0,
