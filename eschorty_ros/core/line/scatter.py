@@ -4,8 +4,9 @@ The second difference of the rows of three columns is zero on a smooth surface, 
 is six variances of a single row, less what all of them share. Its ratio to what the estimator
 expects scales the expected variance: that of the columns' own rows, which sets the gates of
 smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
-remove. No column is in the means of two of those, as texture moves the rows of near columns
-together. So far apart a surface curves: it is the third difference of four columns that is zero.
+remove. No column is in the means of two of those. So far apart a surface curves: it is the third
+difference of four columns that is zero, or near it. Those twice as far apart have more of what
+texture moves near columns by together, and by far more of a surface's shape, which is no scatter.
 """
 
 from __future__ import annotations
@@ -27,18 +28,24 @@ from eschorty_ros.core.line.pixel_locking import (
 
 # Columns from one to the next of those whose rows, or widths, are compared.
 APART = 5
+# The same for smoothed rows, unless their means have more columns.
+_NEAR_APART = 8
+_FAR_APART = 16
 # Share of a profile's differences that the next keeps.
 _KEPT = 0.7
 # Differences without which the scatter near a block is not known.
 _DIFFERENCES_MIN = 8.0
-# The same for smoothed rows: a quarter of those of three blocks. Fewer are left near edges.
-_SMOOTHED_MIN = 24.0
+# The same for smoothed rows: half of a profile's near a block. Fewer are left near edges.
+_SMOOTHED_MIN = 12.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
 # A larger second difference of rows is an edge of the surface, but where most are as large.
 _EDGE_PX = 4.0
 # Standard deviations beyond which a difference is an edge, or a neighbour is not averaged.
 _DEVIATIONS_MAX = 3.0
+# Texture of up to 20 columns makes squared third differences twice as far apart up to so many times
+# as large, a surface's shape 64 times.
+_TEXTURE_MAX = 4.0
 # Largest factor of a variance, and one over the least.
 FACTOR_MAX = 64.0
 # Largest square of a second difference of lengths that are one of two numbers of pixels.
@@ -56,13 +63,14 @@ class Differences(NamedTuple):
 class Scatter(NamedTuple):
     """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
 
-    ``ends`` are of the differences ``own``. A profile has so many edges of the laser as
-    ``laser_edges``.
+    ``ends`` are of the differences ``own``. Those of ``near`` and ``far`` are of smoothed rows. A
+    profile has so many edges of the laser as ``laser_edges``.
     """
 
     own: Differences
     ends: LineEnds
-    smoothed: Differences
+    near: Differences
+    far: Differences
     factor_max: float
     laser_edges: int = 2
 
@@ -70,15 +78,15 @@ class Scatter(NamedTuple):
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    own, smoothed = np.zeros((2, len(Differences._fields), blocks))
-    ends = np.zeros((len(LineEnds._fields), blocks))
-    return Scatter(Differences(*own), LineEnds(*ends), Differences(*smoothed), factor_max)
+    own, near, far = np.zeros((3, len(Differences._fields), blocks))
+    ends = LineEnds(*np.zeros((len(LineEnds._fields), blocks)))
+    return Scatter(Differences(*own), ends, Differences(*near), Differences(*far), factor_max)
 
 
 @kernel
 def _forget_scatter(scatter):
     """Forget all differences."""
-    for sums in (scatter.own, scatter.smoothed):
+    for sums in (scatter.own, scatter.near, scatter.far):
         sums.squares[:] = 0.0
         sums.expected[:] = 0.0
         sums.number[:] = 0.0
@@ -134,21 +142,26 @@ def _third(sigma2, i, j, k, m):
 
 
 @kernel(_nrt=False)
-def _add_smoothed_differences(row, sigma2, averaged, own2, apart, sums):
-    """Add a profile's third differences of smoothed rows, so far ``apart``, to the sums.
+def _add_smoothed_differences(row, sigma2, averaged, own2, apart_min, sums):
+    """Add a profile's third differences of smoothed rows to the sums.
 
-    Larger ones than rows with their ``own2`` variances have are left out, and means of less than
-    half as many columns, so ``averaged``, as the others: edges of the surface.
+    They are ``apart_min`` columns apart, or so far that none is in two means. Larger ones than rows
+    with their ``own2`` variances have are left out, and means of less than half as many columns, so
+    ``averaged``, as the others: edges of the surface. Neighbours share columns, so every second
+    difference will do.
     """
     columns = row.size
-    # Of the four columns to the one in whose block their difference is.
-    before, after = apart + apart // 2, 2 * apart - apart // 2
     for block in range(1, sums.number.size - 1):
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
+        apart = apart_min
+        for c in range(np.uintp(begin), np.uintp(end)):
+            apart = max(apart, int(averaged[c]))
+        # Of the four columns to the one in whose block their difference is.
+        before, after = apart + apart // 2, 2 * apart - apart // 2
         squares, expected, number = 0.0, 0.0, 0.0
         first, last = max(begin, before), min(end, columns - after)
-        for c in range(np.uintp(first), np.uintp(max(first, last))):
-            i = c - np.uintp(before)
+        for pair in range(np.uintp((first + 1) // 2), np.uintp((max(first, last) + 1) // 2)):
+            i = np.uintp(2) * pair - np.uintp(before)
             j = i + np.uintp(apart)
             k = j + np.uintp(apart)
             m = k + np.uintp(apart)
@@ -180,6 +193,20 @@ def _ratio(sums, block, least, factor_max):
         return -1.0
     ratio = _near_sum(sums.squares, block) / _near_sum(sums.expected, block)
     return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
+
+
+@kernel(_nrt=False)
+def _smoothed_ratio(scatter, block):
+    """Return the ratio of smoothed rows near a block; -1 where it is not known.
+
+    It is that of far differences, unless they are too large against near ones for anything but the
+    surface's shape.
+    """
+    near = _ratio(scatter.near, block, _SMOOTHED_MIN, scatter.factor_max)
+    far = _ratio(scatter.far, block, _SMOOTHED_MIN, scatter.factor_max)
+    if min(near, far) < 0.0:
+        return max(near, far)
+    return min(far, max(near, (_TEXTURE_MAX * near) ** 2 / far))
 
 
 @kernel(_nrt=False)
@@ -222,12 +249,12 @@ def _scale_smoothed(rows, scatter, smoothing):
     They are no less than what all columns may share, which is in the scatter where the rows differ.
     """
     returns, columns = rows.row.shape
-    sums, sigma2 = scatter.smoothed, smoothing.sigma2
-    apart = max(BLOCK_COLUMNS, 2 * smoothing.half_widths[-1] + 1)
+    near, far, sigma2 = scatter.near, scatter.far, smoothing.sigma2
     row, used = smoothing.row[0], smoothing.used[0]
-    _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], apart, sums)
-    for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, _SMOOTHED_MIN, scatter.factor_max)
+    _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _NEAR_APART, near)
+    _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _FAR_APART, far)
+    for block in range(1, near.number.size - 1):
+        ratio = _smoothed_ratio(scatter, block)
         factor = min(ratio, scatter.factor_max)
         for k in range(returns):
             for c in range(
