@@ -119,8 +119,9 @@ class ProfileLength:
         end_us, periods = int(t[begin - 1]), 0
         block: tuple[Array, NDArray[np.uint16], NDArray[np.uint16]] | None = None
         if last and t[-1] < end_us + self._span_us:
-            # A short stream has no complete block.
-            begin = first
+            # A short stream has no complete block. Of a long time with few events the end counts.
+            most_us = _PROFILES_MIN * periods_max(self._modulation) * period_us
+            begin = max(first, int(np.searchsorted(t, t[-1] - most_us)))
         for enough in (EVENTS_WANTED, EVENTS_WANTED // 2):
             end_us = self._block_end_us(t, begin, end_us, block is None)
             if watermark_us <= end_us and not last:

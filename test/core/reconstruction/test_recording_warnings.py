@@ -7,12 +7,14 @@ import pytest
 
 from eschorty_ros.core.base.errors import CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
+from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
 from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
 from eschorty_ros.core.storage import ScanLog, load_recording
+from eschorty_ros.core.storage.raw_file import RawWriter
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -121,6 +123,17 @@ def test_a_dark_recording_says_so(tmp_path):
     found = reconstruct_recording(dark)
     assert len(found.points) == 0
     assert "events follow the laser's modulation at 70 Hz" in found.warnings[-1]
+
+
+def test_one_pixel_in_the_dark_for_long_has_the_reason_of_a_dark_recording(tmp_path, recording):
+    n = 600
+    t_us = np.sort(np.random.default_rng(2).integers(0, 60_000_000, n))
+    with RawWriter(tmp_path / "one.raw", NARROW.columns, NARROW.rows) as raw:
+        raw.write(Encoder().encode(t_us, np.full(n, 90), np.full(n, 300), np.arange(n) % 2))
+    dark = replace(at_hz(recording, 1000.0), events_path=tmp_path / "one.raw")
+    found = reconstruct_recording(dark)
+    assert len(found.points) == 0
+    assert "events follow the laser's modulation at 1000 Hz" in found.warnings[-1]
 
 
 def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_events(recording):
