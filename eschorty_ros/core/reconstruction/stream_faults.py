@@ -43,11 +43,12 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
     if is_unreadable(counts):
         return found
     used, bridged = counts["triggers_used"], counts["edges_bridged"]
-    if bridged > used > 0:
+    edges = used + counts["triggers_spurious"]
+    if max(bridged, edges - used) > used > 0:
         found.append(
-            f"the trigger input has an edge in {used} of {used + bridged} periods, which begin "
-            "profiles; where these edges are not the laser's, set trigger_source to "
-            "what the input is wired to, or to none"
+            f"the trigger input has {edges} edges in {used + bridged} periods, and {used} of them "
+            "begin profiles; where they are not the laser's, set trigger_source to what the input "
+            "is wired to, or to none"
         )
     jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
     if jumps > 0:
