@@ -269,10 +269,12 @@ def place(
     ------
     ArgumentError
         When the positions do not match the points, the direction is not a unit vector, or the
-        profiles are none.
+        profiles or the model are none.
     """
     if not isinstance(profiles, Profiles):
         raise ArgumentError(f"profiles is {short(profiles)}; give the Profiles of a Reconstructor")
+    if not isinstance(model, RangeModel):
+        raise ArgumentError(f"model is {short(model)}; give the model of a Reconstructor")
     position = _positions("stage_position_mm", stage_position_mm, len(profiles))
     known = np.isfinite(position)
     if not known.all():

@@ -575,7 +575,7 @@ def test_placing():
     np.testing.assert_array_equal(link["t"], (found.t_us - 1000) * 1e-6)
 
 
-def test_arrays_that_do_not_match_the_points_are_refused():
+def test_what_does_not_match_the_points_is_refused():
     found, _ = reconstruct(encoded(lines(periods=2)))
     points, direction = place_link(found, MODEL), (0.0, 1.0, 0.0)
     for wrong in (np.zeros(len(found) - 1), np.zeros(1)):
@@ -583,6 +583,8 @@ def test_arrays_that_do_not_match_the_points_are_refused():
             add_stage(points, wrong, direction)
     with pytest.raises(ArgumentError, match="range_mm"):
         place_link(replace(found, range_mm=found.range_mm[1:]), MODEL)
+    with pytest.raises(ArgumentError, match="give the model"):
+        place(found, CALIBRATION, 0.0, direction)
 
 
 def test_settings_describe_themselves_and_refuse_bad_values():
