@@ -1,11 +1,16 @@
-"""The modulation frequency that a stream of events shows, by a periodogram of the events' times."""
+"""The modulation that a stream of events shows, by the events' times in steps of 10 us."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+from eschorty_ros.core.modulation.modulation import (
+    FREQUENCY_MAX_HZ,
+    FREQUENCY_MIN_HZ,
+    Modulation,
+)
+from eschorty_ros.core.modulation.phase_estimate import estimate_phase
 
 _BIN_US = 10
 _BINS = 200_000
@@ -24,6 +29,8 @@ _CLOCKS_MAX = 1e-3
 _TURNS_MIN = 8.0
 # Turns over which the power of one frequency falls off.
 _LOBE = 2.0
+# ON events that show the phase, evenly spread.
+_PHASE_EVENTS = 1 << 14
 
 
 class FrequencyEstimate:
@@ -42,6 +49,7 @@ class FrequencyEstimate:
 
     def __init__(self) -> None:
         self._begin_us: int | None = None
+        self._busiest_us = 0
         self._counts = self._busiest = np.zeros((2, _BINS), np.int64)
 
     def add(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
@@ -53,10 +61,22 @@ class FrequencyEstimate:
             place = (t_us[:size] - self._begin_us) // _BIN_US + polarity[:size] * np.int64(_BINS)
             np.add.at(self._counts.reshape(-1), place, 1)
             if self._counts.sum() >= self._busiest.sum():
-                self._busiest = self._counts
+                self._busiest, self._busiest_us = self._counts, self._begin_us
             t_us, polarity = t_us[size:], polarity[size:]
             if t_us.size:
                 self._begin_us = None
+
+    def edge_us(self, modulation: Modulation) -> int | None:
+        """Return a rising edge, from the ON events alone: their burst begins there, or later.
+
+        ``None`` where they have no burst at the frequency of ``modulation``.
+        """
+        t_us = self._busiest_us + np.repeat(np.arange(_BINS) * _BIN_US, self._busiest[1])
+        t_us = t_us[:: max(t_us.size // _PHASE_EVENTS, 1)]
+        if not t_us.size:
+            return None
+        estimate = estimate_phase(t_us, np.ones(t_us.size, np.uint8), modulation)
+        return estimate.edge_us if estimate.found else None
 
     def frequency_hz(self, expected_hz: float) -> float | None:
         """Return the frequency of the bursts, ``expected_hz`` where the events agree with it.

@@ -24,7 +24,7 @@ from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import (
     recording_warnings,
-    shown_frequency_hz,
+    shown_modulation,
 )
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX
@@ -101,7 +101,7 @@ def reconstruct_recording(
     total = recording.events_path.stat().st_size
     done = 0
     with ExitStack() as files, ThreadPoolExecutor(1) as beside:
-        shown = beside.submit(shown_frequency_hz, recording) if jobs > 1 else None
+        shown = beside.submit(shown_modulation, recording) if jobs > 1 else None
         cloud = _Cloud(recording, reconstructor, folder, files)
         for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
             _push(reconstructor, cloud.add, chunk, done, recording.marks)
@@ -123,12 +123,12 @@ def reconstruct_recording(
     counters["points_without_stage"] = cloud.without_stage
     counters["points_outside_scan"] = cloud.outside_scan
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
-    shown_hz = shown_frequency_hz(recording) if shown is None else shown.result()
+    modulation = shown_modulation(recording) if shown is None else shown.result()
     warnings = (
         *map(str, reader.warnings),
         *wrapped,
         *reconstructor.warnings,
-        *recording_warnings(recording, used, counters, points, span_us, shown_hz),
+        *recording_warnings(recording, used, counters, points, span_us, modulation),
     )
     return Result(
         points,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import Points, Recording
@@ -37,6 +39,10 @@ _RETURN = 4.0
 _OTHER_UNIT = 100
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
+# Latency of pixels, part of a period by which events may seem to be before their edge, and the
+# least period in which the latency does not hide it.
+_LATENCY_MAX_US, _EARLY_SHARE = 1000.0, 1.0 / 16.0
+_EDGE_PERIOD_MIN_US = 2.0 * _LATENCY_MAX_US
 _LOSSES = {
     "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
     "it, or raise periods_per_profile = {0.periods_per_profile}",
@@ -51,8 +57,15 @@ _LOSSES = {
 _FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to none"
 
 
-def shown_frequency_hz(recording: Recording) -> float | None:
-    """Return the frequency that the middle of the events shows, ``None`` without any."""
+class Shown(NamedTuple):
+    """The frequency of the laser and one of its edges as the events show them, ``None`` if not."""
+
+    frequency_hz: float | None
+    edge_us: int | None
+
+
+def shown_modulation(recording: Recording) -> Shown:
+    """Return what the middle of the events shows of the laser's modulation."""
     reader, estimate = RawReader(recording.events_path), FrequencyEstimate()
     header = reader.header
     decoder = Decoder(header.width, header.height)
@@ -68,7 +81,9 @@ def shown_frequency_hz(recording: Recording) -> float | None:
             turns = (int(events.t[-1]) - first_us) / recording.modulation.period_us
             if done >= _PIECE_BYTES * (1 if turns > _TURNS_ENOUGH else _PIECES_MAX):
                 break
-    return estimate.frequency_hz(recording.modulation.frequency_hz)
+    modulation = recording.modulation
+    frequency_hz = estimate.frequency_hz(modulation.frequency_hz)
+    return Shown(frequency_hz, estimate.edge_us(modulation))
 
 
 def recording_warnings(
@@ -77,19 +92,19 @@ def recording_warnings(
     counters: Mapping[str, int],
     points: Points,
     span_us: tuple[int, int] | None,
-    shown_hz: float | None,
+    shown: Shown,
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
 
     - ``counters``: See `Result`.
     - ``points``: The cloud, of POINT_DTYPE.
     - ``span_us``: Sensor times of the first and the last event, ``None`` without events.
-    - ``shown_hz``: See `shown_frequency_hz`.
+    - ``shown``: See `shown_modulation`.
     """
     found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
-    stated_hz = recording.modulation.frequency_hz
+    stated_hz, shown_hz = recording.modulation.frequency_hz, shown.frequency_hz
     if recording.calibration_replaced:
         found.append(
             f"the recording is of {recording.calibration_replaced} and reconstructed with "
@@ -105,6 +120,8 @@ def recording_warnings(
             f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
             f"{shown_hz:.4g} Hz; correct it{or_slow}"
         )
+    elif shown.edge_us is not None and len(points) and not counters["triggers_used"]:
+        found += _edge_faults(recording.modulation, shown.edge_us)
     without_stage = counters["points_without_stage"]
     if without_stage:
         first_us, last_us = samples["t_us"][[0, -1]]
@@ -118,6 +135,22 @@ def recording_warnings(
         return found
     dark = without_modulation(counters["events"], stated_hz)
     return [*found, *_few_points(settings, counters, points, dark, shown_hz is not None)]
+
+
+def _edge_faults(modulation: Modulation, shown_us: int) -> list[str]:
+    """Return a line where ``on_edge_us`` is after the edge that the events show, or far before."""
+    period_us = modulation.period_us
+    if modulation.on_edge_us is None or period_us < _EDGE_PERIOD_MIN_US:
+        return []
+    late_us = (shown_us - modulation.on_edge_us + 0.5 * period_us) % period_us - 0.5 * period_us
+    most_us = max(_LATENCY_MAX_US, 0.25 * period_us, modulation.middle_us)
+    if -_EARLY_SHARE * period_us <= late_us <= most_us:
+        return []
+    return [
+        f"on_edge_us in laser.yaml is {abs(late_us):.0f} us {'after' if late_us < 0 else 'before'} "
+        "the edge that the events show, and points have wrong times; correct it, or remove it: "
+        "the phase is then estimated"
+    ]
 
 
 def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:

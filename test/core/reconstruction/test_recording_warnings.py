@@ -32,6 +32,11 @@ def at_hz(recording, frequency_hz):
     return replace(recording, modulation=replace(recording.modulation, frequency_hz=frequency_hz))
 
 
+def with_edge(recording, later_us):
+    edge_us = recording.modulation.on_edge_us + later_us
+    return replace(recording, modulation=replace(recording.modulation, on_edge_us=edge_us))
+
+
 def with_stage(recording, later_us, part=slice(None), scale=1.0):
     samples = recording.stage_samples[part].copy()
     samples["position_mm"] *= scale
@@ -154,6 +159,8 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
             (lambda r, hz=hz: at_hz(r, hz), {}, f"given as {hz} Hz and the events show 70", 1)
             for hz in (35, 71, 100, 140, 700)
         ),
+        (lambda r: with_edge(r, 2000), {}, "us after the edge that the events show", 1),
+        (lambda r: with_edge(r, -5000), {}, "us before the edge that the events show", 1),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
         (lambda r: with_stage(r, 999 * r.stage_samples["t_us"]), {}, "in nanoseconds, write", 1),
