@@ -260,6 +260,11 @@ def _rosbags(name: str) -> ModuleType:
 
 
 def stamp(t_ns: int) -> dict[str, int]:
-    """Return the fields of a ROS time."""
+    """Return the fields of a ROS time; raises ``ArgumentError`` for one that these do not hold."""
     sec, nanosec = divmod(t_ns, 1_000_000_000)
+    if not 0 <= sec < 1 << 31:
+        raise ArgumentError(
+            f"{sec} s since 1970 are no time of a bag; give t_us of stage.csv and on_edge_us of "
+            "laser.yaml in the sensor's time, microseconds"
+        )
     return {"sec": sec, "nanosec": nanosec}

@@ -86,6 +86,14 @@ def test_an_interrupted_conversion_leaves_no_bag(tmp_path, source):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_stage_in_unix_time_gives_no_bag(tmp_path, source):
+    samples = source.stage_samples.copy()
+    samples["t_us"] += 1_700_000_000_000_000
+    with pytest.raises(EschortyError, match="in the sensor's time"):
+        recording_to_bag(replace(source, stage_samples=samples), tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
 def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path, source):
     """Only the driver's events and an odometry, and no clock but the packets' stamps."""
     recording = replace(source, modulation=replace(source.modulation, on_edge_us=None))
