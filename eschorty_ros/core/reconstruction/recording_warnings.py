@@ -125,9 +125,12 @@ def recording_warnings(
     without_stage = counters["points_without_stage"]
     if without_stage:
         first_us, last_us = samples["t_us"][[0, -1]]
+        longest_s = float(np.diff(samples["t_us"]).max()) * 1e-6
+        gapped = recording.scan is not None and 0.0 < recording.scan.stage_gap_s < longest_s
+        gaps = f" with gaps of up to {longest_s:.3g} s" if gapped else ""
         found.append(
             f"stage.csv covers {first_us * 1e-6:.3f} to {last_us * 1e-6:.3f} s of "
-            f"{span_us[0] * 1e-6:.3f} to {span_us[1] * 1e-6:.3f} s: {without_stage:,} of "
+            f"{span_us[0] * 1e-6:.3f} to {span_us[1] * 1e-6:.3f} s{gaps}: {without_stage:,} of "
             f"{len(points) + without_stage:,} points have no stage position; give the stage log "
             "of the same time"
         )

@@ -74,6 +74,13 @@ def with_scan_elsewhere(recording):
     return replace(recording, scan=scan)
 
 
+def with_a_gap_of_the_stage(recording):
+    limits = {"start_mm": 0.0, "stop_mm": 100.0, "stage_gap_s": 0.05}
+    scan = ScanLog(scan_id="s", state="ended", **limits)
+    samples = np.delete(recording.stage_samples, np.arange(30, 41))
+    return replace(recording, stage_samples=samples, scan=scan).earlier(0)
+
+
 def test_a_light_of_the_other_polarity_has_its_reason_alone(tmp_path):
     """ON events come where OFF ones are expected, four fifths of a period later."""
     short = Modulation(70.0, 0.2)
@@ -174,6 +181,7 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
         # In another wrap of the camera's clock, and in the host's time.
         (lambda r: with_stage(r, (4 << 24) + 6_000_000), {}, "have no stage position; give the", 0),
         (lambda r: with_stage(r, 10**8 << 24), {}, "have no stage position; give the stage log", 0),
+        (with_a_gap_of_the_stage, {}, "to 0.825 s with gaps of up to 0.12 s: 768 of", 1),
         (with_scan_elsewhere, {}, "points are outside start to stop of the recorded scan", 0),
         (with_broken_words, {}, "are not as EVT3 has them", 0),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
