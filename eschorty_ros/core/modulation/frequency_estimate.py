@@ -31,6 +31,10 @@ _TURNS_MIN = 8.0
 _LOBE = 2.0
 # ON events that show the phase, evenly spread.
 _PHASE_EVENTS = 1 << 14
+# Least vector strength of the events of a polarity that show the duty cycle, as a line that moves
+# has others in between, and steps in a sum.
+_STRENGTH_MIN = 0.8
+_STEPS_IN_SUM = 10
 
 
 class FrequencyEstimate:
@@ -77,6 +81,19 @@ class FrequencyEstimate:
             return None
         estimate = estimate_phase(t_us, np.ones(t_us.size, np.uint8), modulation)
         return estimate.edge_us if estimate.found else None
+
+    def duty(self, modulation: Modulation) -> float | None:
+        """Return the mean time from ON to OFF events, in periods of ``modulation``.
+
+        ``None`` where most events of one polarity are not in a burst at its frequency.
+        """
+        counts = self._busiest.reshape(2, -1, _STEPS_IN_SUM).sum(axis=2)
+        turns = np.arange(counts.shape[1]) * (_STEPS_IN_SUM * _BIN_US / modulation.period_us)
+        vectors = counts @ np.exp(-2j * np.pi * turns)
+        if np.any(np.abs(vectors) <= _STRENGTH_MIN * counts.sum(axis=1)):
+            return None
+        off, on = np.angle(vectors) / (2.0 * np.pi)
+        return float((on - off) % 1.0)
 
     def frequency_hz(self, expected_hz: float) -> float | None:
         """Return the frequency of the bursts, ``expected_hz`` where the events agree with it.

@@ -43,6 +43,8 @@ _WHOLE = 0.01
 # least period in which the latency does not hide it.
 _LATENCY_MAX_US, _EARLY_SHARE = 1000.0, 1.0 / 16.0
 _EDGE_PERIOD_MIN_US = 2.0 * _LATENCY_MAX_US
+# Part of the period by which the mean times of ON and OFF events may be off.
+_DUTY_APART = 0.125
 _LOSSES = {
     "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
     "it, or raise periods_per_profile = {0.periods_per_profile}",
@@ -58,10 +60,11 @@ _FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to no
 
 
 class Shown(NamedTuple):
-    """The frequency of the laser and one of its edges as the events show them, ``None`` if not."""
+    """What the events show of the laser, an edge and the duty at its frequency; ``None`` if not."""
 
     frequency_hz: float | None
     edge_us: int | None
+    duty: float | None
 
 
 def shown_modulation(recording: Recording) -> Shown:
@@ -83,7 +86,7 @@ def shown_modulation(recording: Recording) -> Shown:
                 break
     modulation = recording.modulation
     frequency_hz = estimate.frequency_hz(modulation.frequency_hz)
-    return Shown(frequency_hz, estimate.edge_us(modulation))
+    return Shown(frequency_hz, estimate.edge_us(modulation), estimate.duty(modulation))
 
 
 def recording_warnings(
@@ -120,8 +123,10 @@ def recording_warnings(
             f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
             f"{shown_hz:.4g} Hz; correct it{or_slow}"
         )
-    elif shown.edge_us is not None and len(points) and not counters["triggers_used"]:
-        found += _edge_faults(recording.modulation, shown.edge_us)
+    elif shown_hz is not None and len(points):
+        found += _duty_faults(recording.modulation, shown.duty)
+        if not counters["triggers_used"]:
+            found += _edge_faults(recording.modulation, shown.edge_us)
     without_stage = counters["points_without_stage"]
     if without_stage:
         first_us, last_us = samples["t_us"][[0, -1]]
@@ -140,10 +145,24 @@ def recording_warnings(
     return [*found, *_few_points(settings, counters, points, dark, shown_hz is not None)]
 
 
-def _edge_faults(modulation: Modulation, shown_us: int) -> list[str]:
+def _duty_faults(modulation: Modulation, shown: float | None) -> list[str]:
+    """Return a line where the duty is not the one that the events show; a sine shows none."""
+    if shown is None or modulation.waveform == "sine":
+        return []
+    apart = abs((modulation.duty - shown + 0.5) % 1.0 - 0.5)
+    if apart <= max(_DUTY_APART, _LATENCY_MAX_US / modulation.period_us):
+        return []
+    return [
+        f"the laser's duty cycle is given as {modulation.duty:g} and the events show {shown:.2f}: "
+        f"points have times that are wrong by {0.5 * apart * modulation.period_us:.0f} us; correct "
+        "it in laser.yaml"
+    ]
+
+
+def _edge_faults(modulation: Modulation, shown_us: int | None) -> list[str]:
     """Return a line where ``on_edge_us`` is after the edge that the events show, or far before."""
     period_us = modulation.period_us
-    if modulation.on_edge_us is None or period_us < _EDGE_PERIOD_MIN_US:
+    if shown_us is None or modulation.on_edge_us is None or period_us < _EDGE_PERIOD_MIN_US:
         return []
     late_us = (shown_us - modulation.on_edge_us + 0.5 * period_us) % period_us - 0.5 * period_us
     most_us = max(_LATENCY_MAX_US, 0.25 * period_us, modulation.middle_us)

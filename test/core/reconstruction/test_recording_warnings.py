@@ -32,6 +32,10 @@ def at_hz(recording, frequency_hz):
     return replace(recording, modulation=replace(recording.modulation, frequency_hz=frequency_hz))
 
 
+def with_duty(recording, duty):
+    return replace(recording, modulation=replace(recording.modulation, duty=duty))
+
+
 def with_edge(recording, later_us):
     edge_us = recording.modulation.on_edge_us + later_us
     return replace(recording, modulation=replace(recording.modulation, on_edge_us=edge_us))
@@ -166,6 +170,8 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
             (lambda r, hz=hz: at_hz(r, hz), {}, f"given as {hz} Hz and the events show 70", 1)
             for hz in (35, 71, 100, 140, 700)
         ),
+        (lambda r: with_duty(r, 0.2), {}, "duty cycle is given as 0.2 and the events show 0.5", 1),
+        (lambda r: with_duty(r, 0.8), {}, "duty cycle is given as 0.8 and the events show 0.5", 1),
         (lambda r: with_edge(r, 2000), {}, "us after the edge that the events show", 1),
         (lambda r: with_edge(r, -5000), {}, "us before the edge that the events show", 1),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
