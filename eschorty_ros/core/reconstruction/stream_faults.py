@@ -13,6 +13,11 @@ _BURST_SHIFT_SHARE = 0.22
 _RATE_CONTROL_SHARE = 0.01
 # Words that a stream which begins anywhere, or goes on after a gap, may break.
 _BROKEN_PER_GAP = 10
+_TIME_FAULTS = {
+    "decoder_time_high_jumps": "jumps forward {}: events are missing there",
+    "decoder_time_high_back": "goes back {}: later events have wrong times, until it is reached "
+    "again; where the camera was started again, make a recording of each start",
+}
 _FEWER_EVENTS = (
     "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
     "bias_diff_off)"
@@ -50,10 +55,11 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
             "begin profiles; where they are not the laser's, set trigger_source to what the input "
             "is wired to, or to none"
         )
-    jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
-    if jumps > 0:
-        times = "once" if jumps == 1 else f"{jumps} times"
-        found.append(f"the camera's time jumps forward {times}: events are missing there")
+    for name, what in _TIME_FAULTS.items():
+        jumps = counts[name] - counts["decoder_gaps"]
+        if jumps > 0:
+            times = "once" if jumps == 1 else f"{jumps} times"
+            found.append(f"the camera's time {what.format(times)}")
     if counts["sensor_drop_words"]:
         found.append(
             f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "

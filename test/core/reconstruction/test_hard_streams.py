@@ -509,6 +509,10 @@ def _without_a_part(words):
     return np.delete(words, np.arange(words.size // 4, words.size // 2))
 
 
+def _started_again(words):
+    return np.concatenate([words, words])
+
+
 def _with_other_words(words):
     words = words.copy()
     words[:: words.size // 50] = 0xD000
@@ -519,6 +523,7 @@ def _with_other_words(words):
     ("change", "reason"),
     [
         (_without_a_part, "time jumps forward once: events are missing there"),
+        (_started_again, "time goes back once: later events have wrong times"),
         (_with_other_words, "words of the events are not as EVT3 has them"),
     ],
 )
