@@ -15,8 +15,8 @@ _RATE_CONTROL_SHARE = 0.01
 _BROKEN_PER_GAP = 10
 _TIME_FAULTS = {
     "decoder_time_high_jumps": "jumps forward {}: events are missing there",
-    "decoder_time_high_back": "goes back {}: later events have wrong times, until it is reached "
-    "again; where the camera was started again, make a recording of each start",
+    "decoder_time_high_back": "goes back {}: events have wrong times until it is reached again; "
+    "where the camera was started again, make a recording of each start",
 }
 _FEWER_EVENTS = (
     "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "

@@ -523,7 +523,7 @@ def _with_other_words(words):
     ("change", "reason"),
     [
         (_without_a_part, "time jumps forward once: events are missing there"),
-        (_started_again, "time goes back once: later events have wrong times"),
+        (_started_again, "time goes back once: events have wrong times"),
         (_with_other_words, "words of the events are not as EVT3 has them"),
     ],
 )
