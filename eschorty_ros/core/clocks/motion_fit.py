@@ -65,8 +65,8 @@ class MotionFit:
         self._positions: list[float] = []
         self._until_ns: int | None = None
         self._spreads_ns: deque[int] = deque(maxlen=_USUAL_READINGS)
-        self._legs = [_Leg(-TIME_LIMIT)]
-        self._delays = _Delays()
+        self._legs = [Leg(-TIME_LIMIT)]
+        self._delays = Delays()
 
     @property
     def until_ns(self) -> int | None:
@@ -111,7 +111,7 @@ class MotionFit:
                 raise ArgumentError(
                     f"earliest_ns is {earliest_ns}, after latest_ns {latest_ns}; swap them"
                 )
-        reading = _Reading(float(position_mm), earliest_ns, latest_ns)
+        reading = Reading(float(position_mm), earliest_ns, latest_ns)
         if self._at_ns and reading.middle_ns <= self._at_ns[-1]:
             self.late_readings += 1
             return
@@ -134,7 +134,7 @@ class MotionFit:
 
     def expect_move(self, plan: MotionPlan) -> None:
         """Expect ``plan``, from rest to rest, to begin at its ``start_ns`` or soon after."""
-        self._begin(_Move(plan, self._tolerance_mm, self._delays))
+        self._begin(Move(plan, self._tolerance_mm, self._delays))
 
     def expect_stop(self, at_ns: int, deceleration_mm_s2: float) -> None:
         """Expect the motion under way to end in a ramp that begins at ``at_ns`` or soon after."""
@@ -144,15 +144,15 @@ class MotionFit:
         if before is None:
             self.expect_unknown(at_ns)
         elif at_ns < before.end_ns:
-            self._begin(_Stop(before, at_ns, deceleration_mm_s2, self._tolerance_mm))
+            self._begin(Stop(before, at_ns, deceleration_mm_s2, self._tolerance_mm))
 
     def expect_unknown(self, at_ns: int) -> None:
         """Use readings alone from ``at_ns`` on."""
-        self._begin(_Leg(integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
+        self._begin(Leg(integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
 
     def discard_motion(self) -> None:
         """Use readings alone for the motion under way."""
-        self._legs[-1] = _Leg(self._legs[-1].from_ns)
+        self._legs[-1] = Leg(self._legs[-1].from_ns)
 
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
         """Return the lowest and highest position between two times; ``None`` if unknown."""
@@ -213,16 +213,16 @@ class MotionFit:
         inside = (t_s >= at_s[0]) & (t_s <= at_s[-1])
         return position, np.where(inside, slopes[piece], 0.0)
 
-    def _begin(self, leg: _Leg) -> None:
+    def _begin(self, leg: Leg) -> None:
         last = self._legs[-1]
-        if isinstance(last, _Move) and last.plan() is not None:
+        if isinstance(last, Move) and last.plan() is not None:
             self._delays = last.delays
         self._legs.append(leg)
         del self._legs[:-_LEGS_MAX]
 
 
 @dataclass(frozen=True, slots=True)
-class _Reading:
+class Reading:
     """One reading of the encoder, taken between the two times."""
 
     position_mm: float
@@ -237,7 +237,7 @@ class _Reading:
         return (self.earliest_ns + self.latest_ns) // 2
 
 
-class _Leg:
+class Leg:
     """A span of time with an unknown motion, from ``from_ns`` on."""
 
     residual_mm = math.nan
@@ -251,7 +251,7 @@ class _Leg:
         """Return the motion from its estimated start; ``None`` if readings contradict it."""
         return None
 
-    def add(self, reading: _Reading) -> None:
+    def add(self, reading: Reading) -> None:
         """Use one reading."""
 
     def known_until_ns(self, spread_ns: float) -> int:
@@ -263,7 +263,7 @@ class _Leg:
         return None
 
 
-class _Move(_Leg):
+class Move(Leg):
     """A trapezoid that begins some time after ``planned.start_ns``.
 
     - ``planned``: Starts at rest, at the earliest possible time.
@@ -271,18 +271,18 @@ class _Move(_Leg):
     - ``usual``: Of the readings of earlier motions.
     """
 
-    def __init__(self, planned: MotionPlan, tolerance_mm: float, usual: _Delays) -> None:
+    def __init__(self, planned: MotionPlan, tolerance_mm: float, usual: Delays) -> None:
         super().__init__(planned.start_ns)
         self.residual_mm = 0.0
         self._shape = planned
         self._tolerance_mm = tolerance_mm
-        self._readings: list[_Reading] = []
+        self._readings: list[Reading] = []
         self._passing_s: list[float] = []
         self._speed: list[float] = []
         self._usual = usual
         self._not_before_s = 0.0
         self._not_after_s = math.inf
-        self._timing: _Timing | None = None
+        self._timing: Timing | None = None
         self._readings_at_refit = 0
         self._fits = True
 
@@ -292,7 +292,7 @@ class _Move(_Leg):
         start_s = self._not_before_s if self._timing is None else self._timing.start_s
         return replace(self._shape, start_ns=self.from_ns + round(start_s * 1e9))
 
-    def add(self, reading: _Reading) -> None:
+    def add(self, reading: Reading) -> None:
         shape, tolerance_mm = self._shape, self._tolerance_mm
         if abs(reading.position_mm - shape.position_mm) <= tolerance_mm:
             if reading.earliest_ns is not None and self._timing is None:
@@ -326,7 +326,7 @@ class _Move(_Leg):
         return self.from_ns + round(begin_s * 1e9)
 
     @property
-    def delays(self) -> _Delays:
+    def delays(self) -> Delays:
         """Delays of the readings so far."""
         return self._usual if self._timing is None else self._timing.delays
 
@@ -345,7 +345,7 @@ class _Move(_Leg):
         last = float(replace(self._shape, start_ns=early_ns).state(latest_ns)[0])
         return min(first, last), max(first, last)
 
-    def _append_passings(self, readings: list[_Reading]) -> None:
+    def _append_passings(self, readings: list[Reading]) -> None:
         """Append the time and speed at which the shape passes each reading."""
         positions = np.array([reading.position_mm for reading in readings])
         passing_s = self._shape.passing_s(positions)
@@ -374,7 +374,7 @@ class _Move(_Leg):
             return
         self._readings_at_refit = count
         positions = np.array([reading.position_mm for reading in self._readings])
-        shape = _fitted_shape(self._shape, positions, earliest_s, latest_s)
+        shape = fitted_shape(self._shape, positions, earliest_s, latest_s)
         if shape is not None:
             before = self._shape, self._passing_s, self._speed
             self._shape, self._passing_s, self._speed = shape, [], []
@@ -392,7 +392,7 @@ class _Move(_Leg):
         passed = ~np.isnan(passing_s)
         if not passed.any():
             return 0.0
-        timing = _start_of(
+        timing = start_of(
             earliest_s[passed] - passing_s[passed],
             latest_s[passed] - passing_s[passed],
             self._tolerance_mm / np.maximum(speed[passed], 1e-3),
@@ -427,7 +427,7 @@ class _Move(_Leg):
         return float(np.sqrt(np.mean(outside**2)))
 
 
-class _Stop(_Leg):
+class Stop(Leg):
     """The profiled end of a move, which begins some time after it was ordered.
 
     The position where the carriage comes to rest determines the time at which the ramp began.
@@ -443,12 +443,12 @@ class _Stop(_Leg):
         self._deceleration_mm_s2 = deceleration_mm_s2
         self._tolerance_mm = tolerance_mm
         self._ordered_ns = at_ns
-        self._last: _Reading | None = None
+        self._last: Reading | None = None
 
     def plan(self) -> MotionPlan | None:
         return self._plan
 
-    def add(self, reading: _Reading) -> None:
+    def add(self, reading: Reading) -> None:
         last, self._last = self._last, reading
         if last is None or abs(last.position_mm - reading.position_mm) > self._tolerance_mm:
             return
@@ -474,7 +474,7 @@ class _Stop(_Leg):
 
 
 @dataclass(frozen=True, slots=True)
-class _Delays:
+class Delays:
     """Mean time (s) from request to sample and from sample to receipt, without the transfer.
 
     A request is written to an idle line; an answer is delayed by adapter, kernel and scheduler.
@@ -485,7 +485,7 @@ class _Delays:
 
 
 @dataclass(frozen=True, slots=True)
-class _Timing:
+class Timing:
     """Start of a motion (s), its standard deviation (s), and which readings agree with it.
 
     It is between ``begin_s`` and ``end_s``; ``begin_s`` is -inf where no request is known.
@@ -496,13 +496,13 @@ class _Timing:
     begin_s: float
     end_s: float
     agreeing: NDArray[np.bool_]
-    delays: _Delays
+    delays: Delays
     bounded_below: bool = False
 
 
-def _start_of(
-    earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array, usual: _Delays
-) -> _Timing:
+def start_of(
+    earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array, usual: Delays
+) -> Timing:
     """Estimate the start from the bounds of each reading.
 
     Delays are positive: the true start is after all ``earliest`` and before all ``latest``. The
@@ -520,21 +520,21 @@ def _start_of(
     agreeing = (earliest_s - slack_s <= middle) & (latest_s + slack_s >= middle)
     use = agreeing & (speed >= _FAST_SHARE * speed[agreeing].max(initial=0.0))
     if not use.any():
-        return _Timing(middle, float(end - begin), begin, end, agreeing, usual)
+        return Timing(middle, float(end - begin), begin, end, agreeing, usual)
     floor_s = float(slack_s[use].min()) + 1e-9
     after = _lower_end(latest_s[use], usual.after_s, floor_s)
     known = use & np.isfinite(earliest_s)
     if not known.any():
-        delays = _Delays(usual.before_s, after.delay_s)
-        return _Timing(after.end_s, after.error_s, begin, end, agreeing, delays)
+        delays = Delays(usual.before_s, after.delay_s)
+        return Timing(after.end_s, after.error_s, begin, end, agreeing, delays)
     before = _lower_end(-earliest_s[known], usual.before_s, floor_s)
     weights = np.array([after.error_s**-2, before.error_s**-2])
     joined = float(weights @ np.array([after.end_s, -before.end_s]) / weights.sum())
     low, high = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
     sigma_s = float(weights.sum() ** -0.5)
     start_s = min(max(joined, low), high)
-    delays = _Delays(before.delay_s, after.delay_s)
-    return _Timing(start_s, sigma_s, begin, end, agreeing, delays, bounded_below=True)
+    delays = Delays(before.delay_s, after.delay_s)
+    return Timing(start_s, sigma_s, begin, end, agreeing, delays, bounded_below=True)
 
 
 def _widest_agreement(low: Array, high: Array) -> tuple[float, float]:
@@ -563,7 +563,7 @@ def _lower_end(values: Array, usual_s: float, floor_s: float) -> _LowerEnd:
     return _LowerEnd(least - correction, max(correction, floor_s), mean_s)
 
 
-def _fitted_shape(
+def fitted_shape(
     plan: MotionPlan, positions: Array, earliest_s: Array, latest_s: Array
 ) -> MotionPlan | None:
     """Return trapezoid ``plan`` with the speed and acceleration that fit the readings' times best.
