@@ -5,6 +5,7 @@ from eschorty_ros.core.clocks.edge_clock import EdgeClock
 from eschorty_ros.core.clocks.edge_fit import fit_edges
 from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks.motion_fit import MotionFit
 from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
 from eschorty_ros.core.clocks.sensor_clock import SensorClock
 from eschorty_ros.core.clocks.stage_track import (
@@ -14,7 +15,6 @@ from eschorty_ros.core.clocks.stage_track import (
     quantise_nm,
 )
 
-# ``motion_fit`` is imported by its own name: it loads scipy.optimize, which takes long.
 __all__ = [
     "NM_PER_MM",
     "NS_PER_US",
@@ -22,6 +22,7 @@ __all__ = [
     "ClockLine",
     "EdgeClock",
     "LowerEnvelope",
+    "MotionFit",
     "MotionPlan",
     "PulseTrain",
     "SensorClock",

@@ -9,7 +9,7 @@ from enum import Enum, auto
 from typing import Protocol
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.core.clocks.motion_fit import MotionFit
+from eschorty_ros.core.clocks import MotionFit
 from eschorty_ros.hardware.base.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_status import LATE_NS, Plausibility, Status, StatusChecks

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks import MotionPlan, plan_move, plan_stop
-from eschorty_ros.core.clocks.motion_fit import MotionFit
+from eschorty_ros.core.clocks import MotionFit, MotionPlan, plan_move, plan_stop
 
 ORDERED_NS = 1_700_000_000_000_000_000
 COUNT_MM = 1 / 20_000
