@@ -56,7 +56,7 @@ THICKNESS_PX = 22.0
 BEND_MM, CONTRAST = 0.8, 1.15
 """Change of slope times distance, and of reflectance, that make an edge."""
 GATES_US = {"mean": 1000}
-"""Phase gate by estimator; the others run without one."""
+"""Phase gate by estimator; the others have the default one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +164,8 @@ def _ratios(
         )
         period, edges = _edges(recording, scene, Settings().smoothing_half_width)
         for method in methods:
-            settings = replace(Settings(), centroid=method, phase_gate_us=GATES_US.get(method, 0))
+            gate_us = GATES_US.get(method, Settings().phase_gate_us)
+            settings = replace(Settings(), centroid=method, phase_gate_us=gate_us)
             profiles = reconstruct_recording(recording, settings).profiles
             errors = scan_errors(profiles, recording, scene)
             known = np.isfinite(errors.error_mm)
