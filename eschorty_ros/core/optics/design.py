@@ -20,6 +20,7 @@ from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXEL_UM,
     PIXELS_MAX,
+    POLE_MARGIN_PX,
     ROWS,
     RangeModel,
     depth_of_field_mm,
@@ -227,8 +228,8 @@ def design_for_ranges(
     The two ranges fix ``K`` and ``b'``; the lens fixes ``k``, so ``k'`` and the sensor tilt
     follow. Parameters as in :func:`design`.
 
-    Raises ``ArgumentError`` when ``0 < near + b < far + b`` does not hold or no sensor tilt reaches
-    both ranges.
+    Raises ``ArgumentError`` when ``0 < near + b < far + b`` does not hold, no sensor tilt reaches
+    both ranges, or the last row would be within 1 px of the pole.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
     integer("rows", rows, 2, PIXELS_MAX)
@@ -243,7 +244,7 @@ def design_for_ranges(
             f"near_mm = {near_mm!r} to far_mm = {far_mm!r} needs sin(theta') = {sine:.3g}; "
             "choose a longer near range or a shorter focal length"
         )
-    return design(
+    build = design(
         focal_length_mm=focal_length_mm,
         f_number=f_number,
         theta_deg=theta_deg,
@@ -254,6 +255,12 @@ def design_for_ranges(
         columns=columns,
         rows=rows,
     )
+    if build.range_limits_mm[1] == math.inf:
+        raise ArgumentError(
+            f"far_mm is {far_mm!r}: the last row would be within {POLE_MARGIN_PX:g} px of "
+            f"infinity; choose less than {rows * near - b_mm:.6g}"
+        )
+    return build
 
 
 def _check_lens(focal_length_mm: float, f_number: float, theta_deg: float, pixel_um: float) -> None:
