@@ -144,7 +144,7 @@ def _posts_table(made: dict[str, Design], measured: dict[str, Posts]) -> DataTab
         step = model.range_per_row_mm(posts.range_mm)
         focus = made[name].at(posts.range_mm).depth_of_field_mm
         columns = (posts.range_mm, posts.row, posts.fit.residual_px,
-                   -posts.fit.residual_px * step, step, focus, posts.magnification)  # fmt: skip
+                   posts.fit.residual_px * step, step, focus, posts.magnification)  # fmt: skip
         rows += [[name, *map(float, line)] for line in zip(*columns, strict=True)]
     return DataTable(
         [
@@ -227,7 +227,7 @@ def _residuals_figure(made: dict[str, Design], measured: dict[str, Posts]) -> Fi
             in_mm.plot(ranges, sign * focus, ":", color=colour, linewidth=1.2)
             in_mm.plot(ranges, sign * step, "--", color=colour, linewidth=1.0)
         at_posts = build.model.range_per_row_mm(posts.range_mm)
-        in_mm.plot(posts.range_mm, -posts.fit.residual_px * at_posts, "o", color=colour, ms=4.5)
+        in_mm.plot(posts.range_mm, posts.fit.residual_px * at_posts, "o", color=colour, ms=4.5)
         in_rows.plot(posts.range_mm, posts.fit.residual_px, "o", color=colour, ms=4.5, label=name)
     in_mm.plot([], [], ":", color="0.4", label="± depth of field (Eq. 3)")
     in_mm.plot([], [], "--", color="0.4", label="± one row (Eq. 4)")

@@ -27,3 +27,9 @@ def test_findings_hold(name):
     assert len(names) == len(set(names)), "two findings share a name"
     missed = [finding for finding in outcome.findings if not finding.holds]
     assert not missed, f"seed {SEED}: {missed}"
+
+
+def test_post_that_appears_in_a_farther_row_has_a_longer_range():
+    table = load("range_curves").run(Effort(fast=True, seed=SEED), lambda *_: None).tables["posts"]
+    row, range_ = (table.columns.index(f"residual_{unit}") for unit in ("px", "mm"))
+    assert all(line[row] * line[range_] > 0.0 for line in table.rows)
