@@ -46,7 +46,7 @@ FALLOFF_MM = (900.0, RANGE_MM, 1600.0, 1900.0)
 LABELS = {
     "ambient": "ambient light over the line's peak",
     "falloff": "range (mm)",
-    "defocus": "plane in focus beside the sheet (mm)",
+    "defocus": "distance of the plane in focus from the sheet (mm)",
     "ghost": "light of a second sheet, 16 mm beside, over the first one's",
     "readout": "time that the readout spends on a row (us)",
 }
@@ -81,18 +81,21 @@ def run(effort: Effort, progress: Progress) -> Outcome:
     progress(0.6, "falloff")
     curves["falloff"] = {
         label: [(r, _scan(Plane(r, slope_column=SLOPE), text, effort)) for r in FALLOFF_MM]
-        for label, text in (("", "none"), ("falloff", f"falloff_mm={RANGE_MM:g}"))
+        for label, text in (
+            ("without falloff", "none"),
+            ("with falloff", f"falloff_mm={RANGE_MM:g}"),
+        )
     }
     progress(0.9, "occlusion")
     step = Steps(RANGE_MM, (0.0,), (-100.0, 0.0), STEP_MM)
     lit = [_scan(step, text, effort, STEP_MM - 5.0, 25.0) for text in ("none", "occlusion=1")]
     for name, label in LABELS.items():
         outcome.figures[name] = _figure(curves[name], label)
-        outcome.captions[name] = f"Errors and coverage of a plane over the {label}"
+        outcome.captions[name] = f"Errors and coverage of a plane against the {label}"
     outcome.figures["occlusion"] = _step_figure(lit, step)
     outcome.captions["occlusion"] = "One column of a step of 100 mm, with and without occlusion"
     rows: list[list[float | str]] = [
-        [f"{name} {label}".strip(), value, *one.figures]
+        [label or name, value, *one.figures]
         for name, both in curves.items()
         for label, scans in both.items()
         for value, one in scans
@@ -178,15 +181,16 @@ def _figure(both: dict[str, list[tuple[float, Scanned]]], label: str) -> Figure:
     error, share = figure.subplots(1, 2)
     for name, scans in both.items():
         x = [value for value, _ in scans]
-        style = "--" if len(both) > 1 and not name else "-"
+        style = "--" if name == "without falloff" else "-"
+        kind = f", {name}" if name else ""
         error.plot(x, [one.median_mm for _, one in scans], "o" + style, color="tab:blue",
-                   label=f"median {name}")  # fmt: skip
+                   label=f"median{kind}")  # fmt: skip
         error.plot(x, [one.p95_mm for _, one in scans], "s" + style, color="tab:orange",
-                   label=f"95th percentile {name}")  # fmt: skip
+                   label=f"95th percentile{kind}")  # fmt: skip
         share.plot(x, [one.complete for _, one in scans], "o" + style, color="tab:green",
-                   label=f"complete {name}")  # fmt: skip
+                   label=f"complete{kind}")  # fmt: skip
         share.plot(x, [one.within for _, one in scans], "s" + style, color="tab:red",
-                   label=f"within 1 sigma {name}")  # fmt: skip
+                   label=f"within 1 sigma{kind}")  # fmt: skip
     error.set(ylabel="error (mm)", yscale="log")
     share.set(ylabel="share of the points", ylim=(0.0, 1.05))
     for axes in (error, share):
