@@ -49,6 +49,8 @@ _ERRORS: dict[str, Callable[[ScanErrors], float]] = {
 def _panel(
     axes: Axes, summaries: Sequence[Summary], error_mm: Callable[[ScanErrors], float]
 ) -> None:
+    from matplotlib.ticker import LogLocator
+
     points = [(one.ns_per_event, error_mm(one.errors)) for one in summaries]
     filters = list(dict.fromkeys(one.variant.filters for one in summaries))
     front = pareto_front(points)
@@ -57,6 +59,9 @@ def _panel(
     line = np.array([points[k] for k in front])
     axes.step(line[:, 0], line[:, 1], "k-", where="post", linewidth=1.0, zorder=1)
     axes.set(xscale="log", yscale="log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
     axes.grid(alpha=0.3, which="both")
 
 
