@@ -66,8 +66,9 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         },
         captions={
             "comparison": "Left: range error (RMS over repeats) of nine posts of two sizes by four "
-            "methods. Right: error of lateral lengths, which is that of k. Blooming biases sizes "
-            "as measured; the fit of the width bias to two sizes corrects it.",
+            "methods. Right: error of lateral lengths, which is that of k; dashed: the bound of "
+            "the findings. Blooming biases sizes as measured; the fit of the width bias to two "
+            "sizes corrects it.",
             "outliers": f"Range error at {CHECK_MM[-1]:.0f} mm when {OUTLIERS} of {OUTLIER_POSTS} "
             f"posts are {OUTLIER_PX[0]:.0f} to {OUTLIER_PX[1]:.0f} rows off: share of calibrations "
             "within an error.",

@@ -80,7 +80,8 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "and background share. 1 is the least an unbiased estimator can reach.",
             "returns": "Left: share of columns with a gross error or no row. Middle and right: how "
             f"often a second line is reported; {SECOND_EVENTS} events in the first, "
-            f"{SECOND_BACKGROUND:.0%} background, FWHM {SECOND_FWHM_PX:g} px.",
+            f"{SECOND_BACKGROUND:.0%} background, FWHM {SECOND_FWHM_PX:g} px; dotted: the least "
+            "strength and distance of a second return.",
             "errors": "68 % of the absolute error over the bound, and in percent the columns with "
             "a gross error (beyond 2 FWHM) or no row",
             "all_errors": "The same for every width, number of events and background share",
