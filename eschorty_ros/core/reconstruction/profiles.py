@@ -132,8 +132,10 @@ class Profiles(LineRows):
         Time of the light on the surface, sensor time: the mean time of the events used, less the
         delay of the stream's events behind the middle of the light where it is known.
     column : uint16
-    row, sigma_row : float64
-        Row of the line and its standard deviation, px.
+    row : float64
+        Row of the line, px.
+    sigma_row : float64
+        Standard deviation of the row, px.
     events : uint32
         Events used.
     width_px : float64
@@ -143,10 +145,14 @@ class Profiles(LineRows):
     flags : uint16
         Bits that state what makes a point worse than its neighbours (1: on two surfaces, 2: cut by
         the sensor's edge, 4: few events); 0 for a good one.
-    reflectance, reflectance_sigma : float64, optional
-        Relative reflectance and its standard deviation; ``None`` where it is not estimated.
-    range_mm, sigma_mm : float64
-        Range along the sheet (Eq. 2) and its standard deviation.
+    reflectance : float64, optional
+        Relative reflectance; ``None`` where it is not estimated.
+    reflectance_sigma : float64, optional
+        Standard deviation of the relative reflectance.
+    range_mm : float64
+        Range along the sheet (Eq. 2).
+    sigma_mm : float64
+        Standard deviation of the range.
     """
 
     range_mm: NDArray[np.float64]

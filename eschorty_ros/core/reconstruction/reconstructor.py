@@ -60,8 +60,10 @@ class Reconstructor:
     model : RangeModel
     modulation : Modulation
         The one in use.
-    first_t_us, newest_t_us : int or None
-        Sensor times of the first and the newest event.
+    first_t_us : int or None
+        Sensor time of the first event.
+    newest_t_us : int or None
+        Sensor time of the newest event.
 
     Raises
     ------
