@@ -47,6 +47,8 @@ _EVENTS_MIN = 4
 # Displacement from profile to profile, in fixed point, at which a gate lags by a few hundredths of
 # a row at most.
 _STILL = 3
+# Profiles one after the other in which the line moves faster; it leaps once to another surface.
+_FASTER_MIN = 3
 # Share of the rows that a gate has to keep.
 _FOUND_MIN = 0.995
 
@@ -57,8 +59,8 @@ class LearnedGate(NamedTuple):
     All have the fields of a `PhaseGate`; the first of the ``choices`` is no gate. The state is
     ``known`` once one is chosen, and has ``changed`` if that is another than before; its ``late``
     is the usual number of late events of a column, ``half`` the half width of the windows of rows
-    in which it is chosen, 0 before, and ``moving`` the displacement of the line then. Windows begin
-    with the gate that is ``kept``.
+    in which it is chosen, 0 before, and ``moving`` the displacement of the line then. The line has
+    moved ``faster`` in so many of the last profiles. Windows begin with the gate that is ``kept``.
     """
 
     state: Any
@@ -87,7 +89,7 @@ def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
 
 
 def _state(gate: PhaseGate) -> Any:
-    state = record(*PhaseGate._fields, "known", "changed", "late", "half", "moving")
+    state = record(*PhaseGate._fields, "known", "changed", "late", "half", "moving", "faster")
     for name, value in gate._asdict().items():
         state[name] = value
     return state
@@ -106,7 +108,7 @@ def _restart_gate(gate):
     """Begin to learn again with the gate that is kept, where it is to be learned."""
     if gate.choices.size > 0:
         _copy_gate(gate.kept, gate.state)
-        gate.state.known = gate.state.changed = 0
+        gate.state.known = gate.state.changed = gate.state.faster = 0
 
 
 @kernel(_nrt=False)
@@ -187,11 +189,14 @@ def _columns_averaged(smoothing):
 
 @kernel(_nrt=False)
 def _displacement_px(history):
-    """Return how far lines move from profile to profile, the mean of the blocks with points."""
+    """Return how far lines move from profile to profile, the mean of the blocks with points.
+
+    It is no more than they have moved in the last one.
+    """
     total, blocks = 0.0, 0
     for block in range(1, history.step_px.size - 1):
         if history.now.points[block] > 0.0:
-            total += history.step_px[block]
+            total += min(history.step_px[block], abs(history.recent.difference[block]))
             blocks += 1
     return total / max(blocks, 1)
 
@@ -213,16 +218,19 @@ def _usual_late(columns, gate):
 def _learn_gate(columns, half, smoothing, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
-    A gate is chosen again when the line moves twice as fast. Returns true in the profile behind the
-    one that changes the gate.
+    A gate is chosen again when the line moves twice as fast, in profiles one after the other.
+    Returns true in the profile behind the one that changes the gate.
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0
     moving = np.int64(_displacement_px(smoothing.widths.history) * FRACTION)
     if state.known > 0:
-        if state.on_span == gate.choices[0].on_span or moving <= max(2 * state.moving, _STILL):
+        uses_gate = state.on_span != gate.choices[0].on_span
+        faster = uses_gate and moving > max(2 * state.moving, _STILL)
+        state.faster = state.faster + 1 if faster else 0
+        if state.faster < _FASTER_MIN:
             return changed
-        state.known = 0
+        state.known = state.faster = 0
     if state.half > 0:
         # The gate in use has narrowed the windows, which leave out late events as well.
         half = state.half

@@ -205,7 +205,7 @@ def _smoothed_ratio(scatter, block):
     near = _ratio(scatter.near, block, _SMOOTHED_MIN, scatter.factor_max)
     far = _ratio(scatter.far, block, _SMOOTHED_MIN, scatter.factor_max)
     if min(near, far) < 0.0:
-        return max(near, far)
+        return far
     return min(far, max(near, (_TEXTURE_MAX * near) ** 2 / far))
 
 

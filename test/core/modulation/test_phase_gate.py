@@ -264,6 +264,24 @@ def test_a_learned_gate_does_not_lag(
     assert median_mm[1] < worse * median_mm[0], "seed 0"
 
 
+def test_a_line_that_leaps_to_another_surface_keeps_its_gate_and_flags(tmp_path):
+    scene = named("steps")
+    calibration = replace(CALIBRATION, columns=640, principal_column=319.5)
+    recording = simulate_recording(
+        tmp_path, scene, calibration, Modulation(70.0), 20.0, 64.0, 50.0, 0,
+        parameters=preset("noisy"),
+    )  # fmt: skip
+    found = both(recording)[1]
+    profiles = found.profiles
+    stage_mm = recording.stage.position_mm(profiles.t_us)
+    truth_mm = true_range_mm(scene, calibration.model(), stage_mm, profiles.column)
+    wrong = np.abs(profiles.range_mm - truth_mm) > 2.2
+    flagged = np.mean(profiles.flags[wrong] > 0)
+    print(f"seed 0: {flagged:.2f} of {wrong.sum()} wrong points have a flag")
+    assert found.counters["events_gated"] > 0.1 * found.counters["events"]
+    assert flagged > 0.5, "seed 0"
+
+
 @pytest.mark.parametrize("case", ["swapped polarity", "wrong frequency"])
 def test_a_learned_gate_that_does_not_help_takes_next_to_nothing(case):
     t, x, y, p = line(70.0)
