@@ -508,8 +508,8 @@ NOT_FOR_USERS = {
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionFit",
-    "clocks.MotionPlan", "clocks.PulseTrain", "clocks.fit_edges", "clocks.leading_edges", "clocks.plan_stop",
-    "clocks.quantise_nm", "line.check_method", "line.events_per_row",
+    "clocks.MotionPlan", "clocks.PulseTrain", "clocks.fit_edges", "clocks.leading_edges",
+    "clocks.plan_stop", "clocks.quantise_nm", "line.check_method", "line.events_per_row",
     # Every key of the file has its own test in test/core/optics.
     "optics.Calibration",
 }  # fmt: skip
