@@ -101,7 +101,7 @@ def reconstruct_recording(
     total = recording.events_path.stat().st_size
     done = 0
     with ExitStack() as files, ThreadPoolExecutor(1) as beside:
-        shown = beside.submit(shown_modulation, recording) if jobs > 1 else None
+        pending = beside.submit(shown_modulation, recording) if jobs > 1 else None
         cloud = _Cloud(recording, reconstructor, folder, files)
         for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
             _push(reconstructor, cloud.add, chunk, done, recording.marks)
@@ -123,12 +123,12 @@ def reconstruct_recording(
     counters["points_without_stage"] = cloud.without_stage
     counters["points_outside_scan"] = cloud.outside_scan
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
-    modulation = shown_modulation(recording) if shown is None else shown.result()
+    shown = shown_modulation(recording) if pending is None else pending.result()
     warnings = (
         *map(str, reader.warnings),
         *wrapped,
         *reconstructor.warnings,
-        *recording_warnings(recording, used, counters, points, span_us, modulation),
+        *recording_warnings(recording, used, counters, points, span_us, shown),
     )
     return Result(
         points,

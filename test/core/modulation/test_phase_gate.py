@@ -266,9 +266,9 @@ def test_a_learned_gate_does_not_lag(
 
 def test_a_line_that_leaps_to_another_surface_keeps_its_gate_and_flags(tmp_path):
     scene = named("steps")
-    calibration = replace(CALIBRATION, columns=640, principal_column=319.5)
+    calibration = replace(CALIBRATION, columns=1280, principal_column=639.5)
     recording = simulate_recording(
-        tmp_path, scene, calibration, Modulation(70.0), 20.0, 64.0, 50.0, 0,
+        tmp_path, scene, calibration, Modulation(70.0), 10.0, 70.0, 50.0, 0,
         parameters=preset("noisy"),
     )  # fmt: skip
     found = both(recording)[1]
