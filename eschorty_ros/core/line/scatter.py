@@ -39,10 +39,11 @@ _DIFFERENCES_MIN = 8.0
 _SMOOTHED_MIN = 12.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
-# A larger second difference of rows is an edge of the surface, but where most are as large.
-_EDGE_PX = 4.0
-# Standard deviations beyond which a difference is an edge, or a neighbour is not averaged.
-_DEVIATIONS_MAX = 3.0
+# Second differences of rows that are those of one pixel or the next: no edges of the surface.
+_PIXEL = 1.0
+# Standard deviations beyond which a difference is an edge, or a neighbour is not averaged, and the
+# mean square of normal deviates within.
+_DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
 # Texture of up to 20 columns makes squared third differences twice as far apart up to so many times
 # as large, a surface's shape 64 times.
 _TEXTURE_MAX = 4.0
@@ -101,29 +102,47 @@ def _add(value, block, sums):
 
 
 @kernel(_nrt=False)
+def _ratio(sums, block, least):
+    """Return the ratio of the squares near a block to those expected; -1 where it is not known."""
+    if _near_sum(sums.number, block) < least:
+        return -1.0
+    expected = _WITHIN2 * _near_sum(sums.expected, block)
+    return min(max(_near_sum(sums.squares, block) / expected, 1.0 / FACTOR_MAX), FACTOR_MAX)
+
+
+@kernel(_nrt=False)
+def _usual_ratio(sums, block, least):
+    """Return the ratio near a block, that of the profile where it is not known, and else 1."""
+    ratio = _ratio(sums, block, least)
+    if ratio >= 0.0:
+        return ratio
+    return sums.squares.sum() / sums.expected.sum() if sums.number.sum() >= least else 1.0
+
+
+@kernel(_nrt=False)
 def _add_differences(row, sigma2, variance, sums, ends):
     """Add a profile's second differences of rows and of lengths to the sums.
 
-    Larger ones of rows than ``_EDGE_PX`` are left out: edges of the surface, but where most are as
-    large.
+    Larger ones of rows than scatter has are left out: edges of the surface.
     """
     columns, apart = row.size, APART
-    usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
-    largest = max(_EDGE_PX, _DEVIATIONS_MAX * usual)
     for block in range(1, sums.number.size - 1):
+        ratio = _usual_ratio(sums, block, _DIFFERENCES_MIN)
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
-            difference = row[before] - 2.0 * row[c] + row[after]
-            if abs(difference) <= largest:
-                squares += difference * difference
-                expected += sigma2[before] + sigma2[after] + 4.0 * sigma2[c]
+            square = (row[before] - 2.0 * row[c] + row[after]) ** 2
+            expected2 = sigma2[before] + sigma2[after] + 4.0 * sigma2[c]
+            largest2 = max(_PIXEL, _DEVIATIONS_MAX**2 * ratio * expected2)
+            if square <= largest2:
+                squares += square
+                expected += expected2
                 number += 1.0
                 # Of neighbours: few of them leap to the next pixel, texture moves both.
                 beside = row[c - np.uintp(1)] - 2.0 * row[c] + row[c + np.uintp(1)]
-                sizes += abs(difference) if np.isnan(beside) else min(abs(beside), largest)
+                sizes += np.sqrt(square if np.isnan(beside) else min(beside * beside, largest2))
                 # The square of a length is 12 variances of evenly lit rows.
                 wider = variance[before] - 2.0 * variance[c] + variance[after]
                 length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
@@ -145,13 +164,13 @@ def _third(sigma2, i, j, k, m):
 def _add_smoothed_differences(row, sigma2, averaged, own2, apart_min, sums):
     """Add a profile's third differences of smoothed rows to the sums.
 
-    They are ``apart_min`` columns apart, or so far that none is in two means. Larger ones than rows
-    with their ``own2`` variances have are left out, and means of less than half as many columns, so
-    ``averaged``, as the others: edges of the surface. Neighbours share columns, so every second
-    difference will do.
+    They are ``apart_min`` columns apart, or so far that none is in two means. Larger ones than
+    scatter has are left out, and means of less than half as many columns, so ``averaged``, as the
+    others: edges of the surface. Neighbours share columns, so every second difference will do.
     """
     columns = row.size
     for block in range(1, sums.number.size - 1):
+        ratio = _usual_ratio(sums, block, _SMOOTHED_MIN)
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         apart = apart_min
         for c in range(np.uintp(begin), np.uintp(end)):
@@ -165,13 +184,14 @@ def _add_smoothed_differences(row, sigma2, averaged, own2, apart_min, sums):
             j = i + np.uintp(apart)
             k = j + np.uintp(apart)
             m = k + np.uintp(apart)
-            difference = row[m] - row[i] - 3.0 * (row[k] - row[j])
-            square, largest2 = difference * difference, _third(own2, i, j, k, m)
+            square = (row[m] - row[i] - 3.0 * (row[k] - row[j])) ** 2
+            expected2 = _third(sigma2, i, j, k, m)
             least = min(averaged[i], averaged[j], averaged[k], averaged[m])
             most = max(averaged[i], averaged[j], averaged[k], averaged[m])
+            largest2 = min(ratio * expected2, _third(own2, i, j, k, m))
             if square <= _DEVIATIONS_MAX**2 * largest2 and 2.0 * least >= most:
                 squares += square
-                expected += _third(sigma2, i, j, k, m)
+                expected += expected2
                 number += 1.0
         _add(squares, block, sums.squares)
         _add(expected, block, sums.expected)
@@ -187,25 +207,16 @@ def _median_difference(row):
 
 
 @kernel(_nrt=False)
-def _ratio(sums, block, least, factor_max):
-    """Return the ratio of the squares near a block to those expected; -1 where it is not known."""
-    if factor_max == 0.0 or _near_sum(sums.number, block) < least:
-        return -1.0
-    ratio = _near_sum(sums.squares, block) / _near_sum(sums.expected, block)
-    return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
-
-
-@kernel(_nrt=False)
 def _smoothed_ratio(scatter, block):
     """Return the ratio of smoothed rows near a block; -1 where it is not known.
 
     It is that of far differences, unless they are too large against near ones for anything but the
     surface's shape.
     """
-    near = _ratio(scatter.near, block, _SMOOTHED_MIN, scatter.factor_max)
-    far = _ratio(scatter.far, block, _SMOOTHED_MIN, scatter.factor_max)
-    if min(near, far) < 0.0:
-        return far
+    near = _ratio(scatter.near, block, _SMOOTHED_MIN)
+    far = _ratio(scatter.far, block, _SMOOTHED_MIN)
+    if min(near, far) < 0.0 or scatter.factor_max == 0.0:
+        return -1.0
     return min(far, max(near, (_TEXTURE_MAX * near) ** 2 / far))
 
 
@@ -219,8 +230,8 @@ def _scale(rows, scatter, smoothing):
     sums = scatter.own
     _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], sums, scatter.ends)
     for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, _DIFFERENCES_MIN, scatter.factor_max)
-        measured = ratio >= 0.0
+        ratio = _ratio(sums, block, _DIFFERENCES_MIN)
+        measured = ratio >= 0.0 and scatter.factor_max > 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
         apart2 = _polarity_variance(smoothing.widths.history.polarities, block)

@@ -128,6 +128,18 @@ def test_a_curved_surface_is_no_scatter(curve_px, times):
     assert np.mean(curved[100:-100]) < times * np.mean(flat[100:-100]), "seed 8"
 
 
+@pytest.mark.parametrize("step_px", [3.0, 6.0, 12.0])
+def test_a_step_is_no_scatter_of_the_columns_beside(step_px):
+    noise_px = np.random.default_rng(8).normal(0.0, 0.2, 1280)
+    flat, stepped = (
+        smoothed(300.0 + np.rint(4.0 * (true_px + noise_px)) / 4.0)[1]
+        for true_px in (0.0, step_px * (COLUMN // 160 % 2))
+    )
+    to_step = np.abs((COLUMN + 80.5) % 160.0 - 80.0)
+    beside = (to_step > 4.0) & (to_step < 40.0) & (COLUMN > 120.0) & (COLUMN < 1160.0)
+    assert np.mean(stepped[beside]) < 1.2 * np.mean(flat[beside]), "seed 8"
+
+
 def test_rows_that_do_not_scatter_have_the_sigma_of_whole_pixels():
     """A column's own variance, reduced by smoothing, is never taken as less than a 64th."""
     _, sigma = smoothed(np.full(400, 300.0))
