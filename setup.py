@@ -33,7 +33,6 @@ setup(
     ],
     install_requires=REQUIREMENTS,
     extras_require={
-        "report": [f"eschorty-experiments @ {(HERE / 'experiments').absolute().as_uri()}"],
         # Apache-2.0: rosbag2 files without ROS, for `eschorty convert` and `reconstruct BAG`.
         "bags": ["rosbags>=0.11"],
         "mesh": ["open3d>=0.19", "libusb-package"],

@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from importlib.util import find_spec
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
@@ -81,6 +82,37 @@ def test_message_packages_build_in_a_workspace_of_their_own(tmp_path: Path, name
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def _built(source: Path, kind: str) -> Path:
+    """Build as pip does and return the one file."""
+    code = f"from setuptools import build_meta; build_meta.build_{kind}('made')"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
+    [built] = (source / "made").glob({"sdist": "*.tar.gz", "wheel": "*.whl"}[kind])
+    return built
+
+
+def test_wheels_of_the_checkout_and_of_the_source_archive_are_the_same(tmp_path: Path) -> None:
+    tree = tmp_path / "tree"
+    unwanted = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "*.egg-info")
+    shutil.copytree(ROOT, tree, ignore=unwanted)
+    archive = _built(tree, "sdist")
+    subprocess.run(["tar", "-xzf", archive, "-C", tmp_path], check=True)
+    unpacked = tmp_path / archive.name.removesuffix(".tar.gz")
+    assert not (unpacked / "test").exists()
+    wheels = [_built(source, "wheel") for source in (unpacked, tree)]
+    contents = []
+    for wheel in wheels:
+        with ZipFile(wheel) as packed:
+            contents.append({name: packed.read(name) for name in packed.namelist()})
+    assert contents[0] == contents[1]
+    assert b"file:" not in next(contents[0][name] for name in contents[0] if "METADATA" in name)
+    sources = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "eschorty_ros").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert sources == {name for name in contents[0] if name.startswith("eschorty_ros/")}
 
 
 def test_versions_agree() -> None:

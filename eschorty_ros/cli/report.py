@@ -61,8 +61,8 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
     """  # noqa: D301
     if not NAMES:
         raise EschortyError(
-            "the experiments are not installed; run `pip install '.[report]'` in the source folder "
-            "of eschorty_ros"
+            "the experiments are not installed; run `pip install . ./experiments` in the source "
+            "folder of eschorty_ros"
         )
     from eschorty_experiments import load
 
