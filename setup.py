@@ -20,7 +20,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=find_packages(include=["eschorty_ros", "eschorty_ros.*"]),
-    package_data={"eschorty_ros.report": ["*.jinja"]},
+    package_data={"eschorty_ros": ["*.pyi", "py.typed"], "eschorty_ros.report": ["*.jinja"]},
     data_files=[
         (
             "share/eschorty_ros/config",

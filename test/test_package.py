@@ -159,3 +159,21 @@ def test_the_public_names_are_there_and_come_on_first_use() -> None:
         "assert not hasattr(es, 'nonsense')"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=ROOT)
+
+
+def test_type_checkers_know_every_public_name(tmp_path: Path) -> None:
+    """An editor completes what they know."""
+    import eschorty_ros as es
+
+    script = tmp_path / "of_a_user.py"
+    shown = "".join(f"reveal_type(es.{name})\n" for name in es.__all__)
+    script.write_text(f"import eschorty_ros as es\n{shown}es.reconstruct('rec').nonsense\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", f"--cache-dir={tmp_path}", script],
+        capture_output=True, text=True, timeout=300, cwd=tmp_path,
+        env=os.environ | {"MYPYPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.stdout.count("Revealed type") == len(es.__all__), done.stdout
+    assert '"Any"' not in done.stdout
+    [error] = [line for line in done.stdout.splitlines() if "error:" in line]
+    assert '"Cloud" has no attribute "nonsense"' in error
