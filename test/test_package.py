@@ -106,7 +106,12 @@ def test_wheels_of_the_checkout_and_of_the_source_archive_are_the_same(tmp_path:
         with ZipFile(wheel) as packed:
             contents.append({name: packed.read(name) for name in packed.namelist()})
     assert contents[0] == contents[1]
-    assert b"file:" not in next(contents[0][name] for name in contents[0] if "METADATA" in name)
+    metadata = next(contents[0][name] for name in contents[0] if "METADATA" in name).decode()
+    assert "file:" not in metadata
+    maintainer = ElementTree.parse(ROOT / "package.xml").find("maintainer")
+    assert maintainer is not None
+    assert f"Maintainer: {maintainer.text}" in metadata
+    assert f"Maintainer-email: {maintainer.get('email')}" in metadata
     sources = {
         str(path.relative_to(ROOT))
         for path in (ROOT / "eschorty_ros").rglob("*")
