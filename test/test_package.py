@@ -140,6 +140,23 @@ def test_imports_without_ros(module: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=ROOT)
 
 
+@pytest.mark.parametrize(
+    ("command", "target"),
+    [("scan", "scan"), ("calibrate --fake", "setup"), ("view --live", "setup")],
+)
+def test_commands_that_need_ros_name_the_make_target(command: str, target: str) -> None:
+    code = (
+        "import sys; sys.modules['rclpy'] = None; "
+        f"from eschorty_ros.cli import main; main({command.split()})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=ROOT
+    )
+    assert done.returncode == 1
+    [line] = done.stderr.splitlines()
+    assert f"run `make {target}`, or source a ROS 2 installation" in line
+
+
 def test_scripts_import_names_that_exist() -> None:
     """Benchmarks and the pages' scripts run by hand."""
     missing = []

@@ -352,7 +352,7 @@ def _calibrate_simulated(
     Writes the calibration with its page, and the sum of all events as a picture; prints the range
     errors of the design and of the calibration.
     """
-    one_calibration = nodes_module("one_process.calibration", make="test")
+    one_calibration = nodes_module("one_process.calibration", make="setup")
     from matplotlib.image import imsave
 
     from eschorty_ros.core.base.files import atomic_write, temporary_folder
