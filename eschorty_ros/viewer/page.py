@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import socket
 import threading
 import time
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from ipaddress import ip_address
 from types import ModuleType
 from typing import Any
 
@@ -74,8 +76,8 @@ class Page:
         self._start: tuple[ScanValues, str] | None = None
         self._cancel = False
         # viser prints lines of its own.
-        with contextlib.redirect_stdout(None):
-            self.server = viser.ViserServer(host=host, port=port, label="eschorty", verbose=False)
+        with contextlib.redirect_stdout(None), _own_pages_only(host):
+            self.server = _private(viser)(host=host, port=port, label="eschorty", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.server.scene.set_up_direction("+z")
         self._build()
@@ -83,7 +85,6 @@ class Page:
 
     def _build(self) -> None:
         gui = self.server.gui
-        # It would open the page to the internet.
         gui.configure_theme(show_share_button=False, show_logo=False)
         self._colour = gui.add_dropdown("colour", COLOURS)
         self._size = gui.add_slider("point size (mm)", 0.1, 5.0, 0.1, 0.8)
@@ -211,6 +212,69 @@ class Page:
         with self._serving, contextlib.redirect_stdout(None):
             self._stopped = True
             self.server.stop()
+
+
+def _private(viser: ModuleType) -> Any:
+    """Return viser's server without its way into the internet, which any page may ask for."""
+
+    class Private(viser.ViserServer):  # type: ignore[name-defined]
+        def request_share_url(self, verbose: bool = True) -> None:
+            """Open no tunnel."""
+
+    return Private
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Make a server that viser starts meanwhile refuse the pages of other sites.
+
+    A browser lets every page connect to it, and viser has no setting for that.
+    """
+    from websockets.asyncio import server
+
+    serve, served = server.serve, []
+
+    def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            sent = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            if refusal := foreign(host, *sent):
+                return connection.respond(403, f"{refusal}\n")
+            return process_request(connection, request)
+
+        served.append(host)
+        return serve(*arguments, process_request=check, **options)
+
+    server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
+    if not served:
+        raise EschortyError("this viser cannot keep other sites out; run: pip install viser==1.1.1")
+
+
+def foreign(host: str, asked: Sequence[str], origins: Sequence[str]) -> str:
+    """Return why a request is not one of the page's own, ``""`` when it is.
+
+    - ``host``: Address that is served on.
+    - ``asked``: The request's headers ``Host``.
+    - ``origins``: Its headers ``Origin``, which a browser adds to a page's requests.
+    """
+    if len(asked) != 1:
+        return "give one Host"
+    if any(origin not in (f"http://{asked[0]}", f"https://{asked[0]}") for origin in origins):
+        return f"pages of {', '.join(origins)} are refused; open http://{asked[0]}"
+    # Another site may give its name the address of this computer.
+    if _is_loopback(host) and not _is_loopback(re.sub(r":\d+$", "", asked[0]).strip("[]")):
+        return f"the name {asked[0]} is refused; use {host}, or start with another --host"
+    return ""
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def open_when_served(host: str, port: int) -> None:

@@ -56,7 +56,7 @@ class Conditions:
 class ScanControl:
     """Decides over requests of a page; light needs the switch and the code of the terminal.
 
-    A page of another site can reach a server on this computer, too: it does not know the code.
+    Whatever else reaches the server does not know the code.
 
     - ``allowed``: Whether scans may be started at all.
     - ``clock``: Returns monotonic seconds.

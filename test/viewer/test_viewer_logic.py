@@ -1,5 +1,6 @@
 """The page's server without a browser: decimation, text, and when a scan may begin."""
 
+import http.client
 import queue
 import socket
 import sys
@@ -13,7 +14,7 @@ from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
 from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
-from eschorty_ros.viewer.page import open_when_served
+from eschorty_ros.viewer.page import Page, open_when_served
 from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
 from eschorty_ros.viewer.status import Status, laser_text
 
@@ -167,6 +168,55 @@ def test_a_page_without_viser_or_on_a_taken_port_is_one_line(tmp_path, monkeypat
     done = CliRunner().invoke(main, view)
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
     assert "pip install viser" in done.stderr
+
+
+@pytest.fixture
+def served():
+    """A page with a cloud, on a free port of this computer."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    page = Page(GrowingCloud(), port=port)
+    yield page
+    page.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "origin", "status"),
+    [
+        ("127.0.0.1", None, 200),
+        ("127.0.0.1", "http://127.0.0.1", 200),
+        ("localhost", "http://localhost", 200),
+        ("[::1]", "https://[::1]", 200),
+        ("127.0.0.1", "http://localhost", 403),
+        ("127.0.0.1", "http://other.example", 403),
+        ("127.0.0.1", "null", 403),
+        ("other.example", None, 403),
+        ("other.example", "http://other.example", 403),
+    ],
+)
+def test_only_the_pages_own_requests_are_answered(served, name, origin, status):
+    """Those of other sites in the same browser are not: by file or by socket."""
+    port = served.server.get_port()
+    headers = {"Host": f"{name}:{port}"}
+    if origin is not None:
+        headers["Origin"] = origin if origin == "null" else f"{origin}:{port}"
+    socket_headers = {
+        "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    }  # fmt: skip
+    for more, wanted in (({}, status), (socket_headers, 101 if status == 200 else status)):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+        connection.request("GET", "/", headers=headers | more)
+        assert connection.getresponse().status == wanted
+        connection.close()
+
+
+def test_no_page_opens_a_way_into_the_internet(served, monkeypatch):
+    tunnels = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *where: tunnels.append(where))
+    assert served.server.request_share_url() is None
+    assert tunnels == []
 
 
 def test_a_page_is_opened_on_a_desktop_once_it_is_served(monkeypatch):
