@@ -34,6 +34,7 @@ _NAMES = {
 }  # fmt: skip
 _AHEAD = 1.3
 _SERVED_S, _POLL_S = 300.0, 0.5
+_UNREAD_S = 5.0
 
 
 def load_viser() -> ModuleType:
@@ -76,7 +77,7 @@ class Page:
         self._start: tuple[ScanValues, str] | None = None
         self._cancel = False
         # viser prints lines of its own.
-        with contextlib.redirect_stdout(None), _own_pages_only(host):
+        with contextlib.redirect_stdout(None), _guarded(host):
             self.server = _private(viser)(host=host, port=port, label="eschorty", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.server.scene.set_up_direction("+z")
@@ -225,26 +226,30 @@ def _private(viser: ModuleType) -> Any:
 
 
 @contextlib.contextmanager
-def _own_pages_only(host: str) -> Iterator[None]:
-    """Make a server that viser starts meanwhile refuse the pages of other sites.
+def _guarded(host: str) -> Iterator[None]:
+    """Make a server that viser starts meanwhile refuse other sites, and pages that read nothing.
 
-    A browser lets every page connect to it, and viser has no setting for that.
+    A browser lets every site connect to it. viser has no setting for either.
     """
     from websockets.asyncio import server
 
     serve, served = server.serve, []
 
-    def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
+    def serve_guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
             sent = (request.headers.get_all(name) for name in ("Host", "Origin"))
             if refusal := foreign(host, *sent):
                 return connection.respond(403, f"{refusal}\n")
+            # A computer that vanishes closes nothing; pings wait behind what it has not read.
+            connection.transport.get_extra_info("socket").setsockopt(
+                socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(_UNREAD_S * 1e3)
+            )
             return process_request(connection, request)
 
         served.append(host)
         return serve(*arguments, process_request=check, **options)
 
-    server.serve = guarded  # type: ignore[assignment,misc]
+    server.serve = serve_guarded  # type: ignore[assignment,misc]
     try:
         yield
     finally:

@@ -6,9 +6,13 @@ import socket
 import sys
 import time
 
+import msgspec
 import numpy as np
 import pytest
+import viser
 from click.testing import CliRunner
+from websockets import Subprotocol
+from websockets.sync.client import connect
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
@@ -16,7 +20,7 @@ from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
 from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
 from eschorty_ros.viewer.page import Page, open_when_served
 from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
-from eschorty_ros.viewer.status import Status, laser_text
+from eschorty_ros.viewer.status import Status, laser_text, points_text
 
 CLOUD = "c.pcd"
 READY = Conditions(scanner=True, laser=True, interlock_open=False)
@@ -210,6 +214,33 @@ def test_only_the_pages_own_requests_are_answered(served, name, origin, status):
         connection.request("GET", "/", headers=headers | more)
         assert connection.getresponse().status == wanted
         connection.close()
+
+
+def test_a_page_that_reads_nothing_is_no_open_page(served):
+    """A computer that has vanished or stalled keeps no scan going."""
+    url = f"ws://127.0.0.1:{served.server.get_port()}"
+    camera = {
+        "type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0,
+        "near": 0.1, "far": 10.0, "image_height": 100, "image_width": 100, "look_at": (1, 0, 0),
+        "up_direction": (0, 0, 1),
+    }  # fmt: skip
+    own = Subprotocol(f"viser-v{viser.__version__}")
+    reading = connect(url, subprotocols=[own], max_queue=None, max_size=None)
+    stalled = connect(url, subprotocols=[own], max_queue=1, max_size=None)
+    for client in (reading, stalled):
+        client.send(msgspec.msgpack.encode(camera))
+    end_s = time.monotonic() + 30.0
+    while served.pages < 2:
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+    while served.pages > 1:
+        assert time.monotonic() < end_s, "still counted"
+        served._cloud.add(numbered(0, 50_000))
+        served.show(points_text)
+        time.sleep(0.1)
+    assert served.pages == 1
+    stalled.socket.close()
+    reading.close()
 
 
 def test_no_page_opens_a_way_into_the_internet(served, monkeypatch):
