@@ -311,5 +311,6 @@ def _check_free(host: str, port: int) -> None:
             probe.bind((host, port))
         except OSError as error:
             raise ArgumentError(
-                f"{host}:{port} cannot be served ({error.strerror}); choose another --port"
+                f"{host}:{port} cannot be served ({error.strerror}); "
+                "choose another --host or --port"
             ) from error

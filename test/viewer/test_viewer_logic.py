@@ -167,7 +167,7 @@ def test_a_page_without_viser_or_on_a_taken_port_is_one_line(tmp_path, monkeypat
         view = ["view", str(tmp_path / CLOUD), "--browser", "--port", port]
         done = CliRunner().invoke(main, view)
         assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
-        assert "choose another --port" in done.stderr
+        assert "choose another --host or --port" in done.stderr
     monkeypatch.setitem(sys.modules, "viser", None)
     done = CliRunner().invoke(main, view)
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
@@ -265,6 +265,6 @@ def test_a_page_is_opened_on_a_desktop_once_it_is_served(monkeypatch):
     assert opened.empty()
     with socket.create_server(address):
         assert opened.get(timeout=10.0) == "http://{}:{}".format(*address)
-        with pytest.raises(ArgumentError, match="choose another --port"):
+        with pytest.raises(ArgumentError, match="choose another --host or --port"):
             open_when_served(*address)
     assert opened.empty()
