@@ -23,6 +23,8 @@ OPERATOR = "operator"
 # it on.
 OPERATOR_CALLS = {"scan", "calibrate", "stage/move"}
 OPERATOR_REQUESTS = {"laser/reset_interlock", "laser/enable"}
+# The nodes that the commands of `ros2` make for themselves: a service that is refused ends them.
+_COMMAND_NODES = "/_ros2cli*"
 _COMMON_TOPICS = ("/rosout", "/parameter_events")
 _HIDDEN = "/_action/"
 
@@ -56,14 +58,19 @@ def rights(node: Node) -> Rights:
     }
 
 
-def operator_rights(nodes: Iterable[Rights]) -> Rights:
+def operator_rights(nodes: list[Rights]) -> Rights:
     """Return those of a person at a terminal."""
     published = {name for table in nodes for name in table["topics", "publish"]}
     served = {name for table in nodes for name in table["services", "reply"]}
     executed = {name for table in nodes for name in table["actions", "execute"]}
+    # Those that every node has, for its parameters and types.
+    own = set.intersection(
+        *({name.rpartition("/")[2] for name in table["services", "reply"]} for table in nodes)
+    )
     harmless = ("/get_parameters", "/list_parameters", "/get_state", "/dump_statistics")
     return {
         ("actions", "call"): executed & {f"{NAMESPACE}/{name}" for name in OPERATOR_CALLS},
+        ("services", "reply"): {f"{_COMMAND_NODES}/{name}" for name in own},
         ("services", "request"): {
             name
             for name in served

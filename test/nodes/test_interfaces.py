@@ -1,10 +1,14 @@
 """docs/interfaces.md describes every topic, service, action and parameter of the nodes."""
 
 from collections.abc import Iterator
+from fnmatch import fnmatch
+from xml.etree import ElementTree
 
 import interfaces as tables
 import policies
 import pytest
+from eschorty_ros.action import Scan
+from rclpy.action import ActionClient
 from rclpy.node import Node
 
 from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
@@ -65,6 +69,23 @@ def test_what_the_reconstruction_makes_for_a_calibration_is_allowed(nodes):
     allowed = policies.rights(node)
     for key, names in needed.items():
         assert {name for name in names if "/calibrating/" not in name} <= allowed[key], key
+
+
+def test_a_command_at_the_operators_terminal_may_make_its_node(nodes):
+    """As `ros2 action send_goal` does; its names end in numbers of their own."""
+    command = Node("_ros2cli_send_goal_4711", use_global_arguments=False)
+    try:
+        ActionClient(command, Scan, f"{tables.NAMESPACE}/scan")
+        needed = policies.rights(command)
+    finally:
+        command.destroy_node()
+    assert needed["services", "reply"]
+    root = ElementTree.parse(policies.file_of(policies.OPERATOR))
+    for (element, right), names in needed.items():
+        groups = [group for group in root.iter(element) if group.get(right) == "ALLOW"]
+        allowed = [str(item.text) for group in groups for item in group]
+        refused = {name for name in names if not any(fnmatch(name, text) for text in allowed)}
+        assert refused == set(), f"{element} {right}"
 
 
 def test_only_scanner_and_reconstruction_may_light_the_laser_under_sros2(nodes):
