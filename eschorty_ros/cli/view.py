@@ -90,6 +90,8 @@ def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
     open_when_served(host, port)
     values = {"allow_scan": str(allow_scan).lower(), "host": host, "port": str(port)}
     given = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
+    # As the launch files do it; without effect unless ROS_SECURITY_ENABLE is set.
+    given += ["--enclave", "/eschorty/viewer"]
     if node.main(["--ros-args", "-r", "__ns:=/eschorty", *given]):
         raise DeviceError("the viewer ended with an error; see the message above")
 

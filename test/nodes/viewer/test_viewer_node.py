@@ -7,12 +7,14 @@ import time
 
 import pytest
 import rclpy
+from click.testing import CliRunner
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState, ReconstructionState
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from eschorty_ros.cli import main
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import refusals
 from eschorty_ros.nodes.ros.executor import Spinning
@@ -196,3 +198,20 @@ def test_a_scan_that_is_to_be_recorded_needs_a_reconstruction(world):
         ask(viewer, VALUES._replace(record="/data"))
         wait(says(viewer, "not started: no reconstruction to record"))
         assert not node.goals
+
+
+def test_the_command_starts_the_node_as_the_launch_files_do(monkeypatch):
+    given = []
+    monkeypatch.setattr(viewer_module, "main", given.extend)
+    done = CliRunner().invoke(main, ["view", "--live", "--port", str(free_port())])
+    assert done.exit_code == 0, done.output
+    rclpy.init(args=given)
+    try:
+        node = Node("viewer")
+        assert node.get_fully_qualified_name() == "/eschorty/viewer"
+        assert (node.get_name(), "/eschorty", "/eschorty/viewer") in (
+            node.get_node_names_and_namespaces_with_enclaves()
+        )
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
