@@ -59,6 +59,20 @@ def test_both_lists_of_python_packages_are_the_same() -> None:
     assert {f"python3-{keys.get(name, name)}" for name in names} <= needed
 
 
+def test_the_package_names_what_its_nodes_and_launch_files_import_of_ros() -> None:
+    ours = {"ament_index_python", "launch", "launch_ros", "rclpy"}
+    imported = set()
+    for script in (*ROOT.glob("eschorty_ros/**/*.py"), *ROOT.glob("launch/*.py")):
+        for node in ast.walk(ast.parse(script.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+            imported |= {name.partition(".")[0] for name in names}
+    messages = {name for name in imported if name.endswith(("_msgs", "_srvs", "_interfaces"))}
+    needed = {element.text for element in ElementTree.parse(ROOT / "package.xml").iter()}
+    assert ours <= imported
+    assert (ours | messages) - needed == set()
+
+
 def test_the_oldest_versions_are_those_that_are_tested() -> None:
     bounds, pins = (
         {line.replace(">=", "==") for line in (ROOT / "requirements" / name).read_text().split()}
