@@ -203,15 +203,20 @@ def _distance(first: Part, other: Part, common_mm: float) -> Value:
 
 
 def _angle(first: Plane, other: Plane) -> Value:
-    """Return the angle between two planes; its sigma is along the difference of the slopes."""
-    one, two = (np.array([1.0, *-plane.slopes]) * plane.cosine for plane in (first, other))
-    angle = math.atan2(float(np.linalg.norm(np.cross(one, two))), float(one @ two))
-    apart = other.slopes - first.slopes
-    covariance = (first.covariance + other.covariance)[1:, 1:]
-    length = float(np.linalg.norm(apart))
-    direction = apart / length if length > 0.0 else np.array([1.0, 0.0])
-    sigma = math.sqrt(float(direction @ covariance @ direction))
-    return Value(math.degrees(angle), math.degrees(sigma * first.cosine * other.cosine))
+    """Return the angle between two planes; its sigma is that of tilts about their common line."""
+    one, two = first.normal, other.normal
+    line = np.cross(one, two)
+    sine = float(np.linalg.norm(line))
+    # Parallel planes have no common line: any across the range.
+    axis = line / sine if sine > 0.0 else np.array([0.0, 0.0, 1.0])
+    variance = 0.0
+    for plane, normal in ((first, one), (other, two)):
+        # Each normal turns by its own cosine, a steep one by little.
+        turn = -np.cross(axis, normal)[1:] * plane.cosine
+        variance += float(turn @ plane.covariance[1:, 1:] @ turn)
+    return Value(
+        math.degrees(math.atan2(sine, float(one @ two))), math.degrees(math.sqrt(variance))
+    )
 
 
 def _joint(first: Part, other: Part) -> tuple[Value, tuple[float, float]]:

@@ -79,6 +79,11 @@ class Plane(NamedTuple):
         return float(1.0 / np.sqrt(1.0 + self.slopes @ self.slopes))
 
     @property
+    def normal(self) -> Array:
+        """Unit normal, away from the sensor."""
+        return np.array([1.0, *-self.slopes]) * self.cosine
+
+    @property
     def rms_mm(self) -> float:
         """Root mean square of the kept residuals."""
         return float(np.sqrt(np.mean(self.residual[self.kept] ** 2)))

@@ -67,6 +67,20 @@ def test_the_sigma_of_a_plane_follows_the_errors_that_neighbours_share(smooth):
         assert 0.75 < seen / stated < 1.3, axis
 
 
+@pytest.mark.parametrize(("left", "right"), [(0.0, 0.2), (0.0, 1.0), (0.0, 5.0), (-1.0, 1.0)])
+def test_the_sigma_of_an_angle_holds_for_steep_planes_too(left, right):
+    """Angles of 40 pairs of planes of different slopes scatter as their sigmas state."""
+    true = np.degrees(np.arctan(right) - np.arctan(left))
+    parts = (parse_region(":180,:"), parse_region("220:,:"))
+    angles = []
+    for seed in range(40):
+        points = cloud(lambda y, z: 1300.0 + np.where(z < 0.0, left, right) * z, seed=seed)
+        angles.append(measure(points, parts, 0.0).pairs[0].angle_deg)
+    off = np.array([angle.value - true for angle in angles])
+    stated = np.sqrt(np.mean([angle.sigma**2 for angle in angles]))
+    assert 0.75 < np.sqrt(np.mean(off**2)) / stated < 1.3
+
+
 def test_small_parts_of_a_plane_are_no_bent_ones():
     """The pixels' pattern, the same in every period and alike in 17 columns; seeds 0 to 11."""
     parts, bent = (Region((100, 299), (5.0, 25.0)), Region((100, 214), (5.0, 15.0))), 0
