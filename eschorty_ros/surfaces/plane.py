@@ -210,16 +210,23 @@ def check_part(part: Part) -> None:
 
 
 def flatness(part: Part, plane: Plane) -> Flatness:
-    """Return the flatness of a part about its plane; NaN when it is too small for four cells."""
-    line, column = part.line[plane.kept], part.column[plane.kept]
-    residual = plane.residual[plane.kept]
+    """Return the flatness of a part about its plane; NaN when it is too small for four cells.
+
+    Left out are points far from the others of their cell. Those far from the plane, yet not alone,
+    are form: a dent or a pocket.
+    """
     fine = 4
-    cells, down, aside = (_cells(line, column, count) for count in ((1, 1), (fine, 1), (1, fine)))
+    cells, down, aside = (
+        _cells(part.line, part.column, count) for count in ((1, 1), (fine, 1), (1, fine))
+    )
+    kept = _alike(plane.residual / part.sigma, cells)
+    residual, sigma = plane.residual[kept], part.sigma[kept]
+    cells, down, aside = cells[kept], down[kept], aside[kept]
     total = int(cells.max()) + 1
     count = np.bincount(cells, minlength=total)
     mean = np.bincount(cells, residual, total) / np.maximum(count, 1)
     used = count >= 0.25 * np.median(count[count > 0])
-    own = np.bincount(cells, part.sigma[plane.kept] ** 2, total) / np.maximum(count, 1) ** 2
+    own = np.bincount(cells, sigma**2, total) / np.maximum(count, 1) ** 2
     variance = own * max(1.0, *(_excess(residual, at, cells, used, own) for at in (down, aside)))
     # A plane follows three cells by itself.
     if np.count_nonzero(used) < 4:
@@ -234,6 +241,16 @@ def flatness(part: Part, plane: Plane) -> Flatness:
         Value(float(mean[high] - mean[low]), float(np.hypot(sigma[high], sigma[low]))),
         2.0 * largest * float(np.median(sigma)),
     )
+
+
+def _alike(ratio: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which points are within 4 robust sigma of the median of their cell."""
+    alike = np.zeros(len(ratio), bool)
+    for cell in np.unique(cells):
+        at = np.flatnonzero(cells == cell)
+        off = np.abs(ratio[at] - np.median(ratio[at]))
+        alike[at] = off <= CUT_SIGMA * max(MAD * float(np.median(off)), 1.0)
+    return alike
 
 
 def _cells(

@@ -95,6 +95,23 @@ def test_small_parts_of_a_plane_are_no_bent_ones():
     assert bent == 0
 
 
+@pytest.mark.parametrize("deep_mm", [0.5, 3.0, 30.0])
+def test_the_flatness_of_a_plane_holds_its_pocket_however_deep(deep_mm):
+    """A pocket of 10 by 15 mm is form; points that are alone beside the plane are none."""
+
+    def plate(y, z):
+        alone = np.random.default_rng(3).random(np.broadcast(y, z).shape) < 0.05
+        pocket = (np.abs(y - 20.0) < 5.0) & (np.abs(z - 20.0) < 7.5)
+        return 1300.0 + 0.2 * y + 0.0 * z + np.where(alone, 50.0, 0.0) + deep_mm * pocket
+
+    flat = measure(cloud(plate), (Region(ALL, ALL),)).surfaces[0].flat
+    cosine = 1.0 / np.hypot(1.0, 0.2)
+    # Noise of the cells adds to peak and valley.
+    off_mm = flat.value_mm.value - deep_mm * cosine
+    assert abs(off_mm) < flat.of_plane_mm + flat.value_mm.sigma
+    assert flat.of_no_plane
+
+
 def test_surfaces_gap_step_and_flatness_are_found_without_regions():
     """Two panels, 10 mm apart along z, one 4 mm farther and with a dent of 1.5 mm."""
 
