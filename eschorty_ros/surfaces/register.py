@@ -28,7 +28,9 @@ _ROUNDS, _ITERATIONS = 4, 15
 _CONVERGED_SIGMAS = 0.01
 # Neighbours of a normal; its noise must not look like the relief of the surface.
 _NORMAL_NEIGHBOURS = 150
-_RELIEF_MIN = 4.0
+# Of the noise alone; normals at a rim are one-sided, the same way in both clouds: spheres show 1.4
+# to 5.1, cones of 45 degrees up to 7.3.
+_RELIEF_MIN = 10.0
 _PERIODS_APART = 10
 _WITHOUT_PERIOD_S = 1.0
 

@@ -20,6 +20,17 @@ def relief(y, z):
     return 1300.0 + waves + 3.0 * np.sin(z / 3.1)
 
 
+def ball(y, z):
+    """A ball of 15 mm up to near its rim, where surfaces are steep and normals one-sided."""
+    aside = (y - 20.0) ** 2 + (z + 25.0) ** 2
+    return np.where(aside < 14.0**2, 1290.0 - np.sqrt(np.maximum(225.0 - aside, 0.0)), np.nan)
+
+
+def cone(y, z):
+    aside = np.hypot(y - 20.0, z + 25.0)
+    return np.where(aside < 18.0, 1290.0 + aside, np.nan)
+
+
 def known_pose(seed):
     """Some 0.4 degrees about the middle of the cloud, and 1 mm."""
     rng = np.random.default_rng(seed)
@@ -65,6 +76,8 @@ def test_a_shift_by_half_a_pitch_is_not_drawn_to_the_grid():
     [
         (lambda y, z: 1300.0 + 0.1 * y + 0.0 * z, "slides along"),
         (lambda y, z: 1300.0 + 4.0 * np.sin(y / 5.0) + 0.0 * z, "slides along z"),
+        (ball, "turns about|slides along"),
+        (cone, "turns about x"),
     ],
 )
 @pytest.mark.parametrize("sigma_mm", [0.08, 0.17, 0.6])
