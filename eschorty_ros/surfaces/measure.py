@@ -28,6 +28,8 @@ _PIECE_MIN = 0.02
 _MEDIAN_HALF = 2
 # Points near a step are on both sides of the line's thickness: cells taken off each surface.
 _RIM = 3
+# From there to the edge: the rim, the cell beside the step and 4 over which smoothing spreads it.
+_TO_EDGE = _RIM + 5
 
 
 class Region(NamedTuple):
@@ -47,6 +49,8 @@ class Surface(NamedTuple):
     flat: Flatness
     common_mm: float
     """Standard deviation of the range error that its points share."""
+    whole: Part
+    """The part with its rims, up to the edges that face other surfaces."""
 
     @property
     def range_mm(self) -> Value:
@@ -120,8 +124,12 @@ def measure(
     if common_mm is not None:
         number("common_mm", common_mm, 0.0)
     grid = organise(points)
-    masks = [_mask(grid, region) for region in regions] or _found(grid)
+    masks, free = [_mask(grid, region) for region in regions], None
+    if not masks:
+        masks, free = _found(grid)
     surfaces = tuple(_surface(grid, mask, common_mm) for mask in masks)
+    if free is not None:
+        surfaces = _to_edges(grid, surfaces, free)
     pairs = tuple(_pair(surfaces[0], other) for other in surfaces[1:])
     return Measured(grid, surfaces, pairs)
 
@@ -134,8 +142,8 @@ def _mask(grid: CloudGrid, region: Region) -> NDArray[np.bool_]:
         return inside & (grid.xyz[..., 1] >= low) & (grid.xyz[..., 1] <= high)
 
 
-def _found(grid: CloudGrid) -> list[NDArray[np.bool_]]:
-    """Return the surfaces between steps, the largest first."""
+def _found(grid: CloudGrid) -> tuple[list[NDArray[np.bool_]], NDArray[np.bool_]]:
+    """Return the surfaces between steps, the largest first, and the points of no piece."""
     from scipy.ndimage import binary_erosion, binary_fill_holes, label
 
     known, joined = grid.known, links(smoothed(grid, _MEDIAN_HALF), STEP_SIGMAS)
@@ -156,7 +164,32 @@ def _found(grid: CloudGrid) -> list[NDArray[np.bool_]]:
             f"no surface holds {_PIECE_MIN:.0%} of the {np.count_nonzero(known):,} points; "
             "choose regions"
         )
-    return masks
+    return masks, known & (number == 0)
+
+
+def _to_edges(
+    grid: CloudGrid, surfaces: tuple[Surface, ...], free: NDArray[np.bool_]
+) -> tuple[Surface, ...]:
+    """Return surfaces with their rims; between two each point belongs to the nearer plane."""
+    from scipy.ndimage import binary_dilation
+
+    rims, nearest = [], np.full(free.shape, np.inf)
+    for surface in surfaces:
+        grown = binary_dilation(surface.mask, iterations=_TO_EDGE, mask=surface.mask | free)
+        rim = np.nonzero(grown & free)
+        x, y, z = grid.xyz[rim].T
+        plane = surface.plane
+        off = np.abs(
+            x - plane.centre[0] - (np.column_stack([y, z]) - plane.centre[1:]) @ plane.slopes
+        )
+        nearest[rim] = np.minimum(nearest[rim], off)
+        rims.append((rim, off))
+    made = []
+    for surface, (rim, off) in zip(surfaces, rims, strict=True):
+        mask = surface.mask.copy()
+        mask[rim] = off <= nearest[rim]
+        made.append(surface._replace(whole=Part.of(grid, mask)))
+    return tuple(made)
 
 
 def _surface(grid: CloudGrid, mask: NDArray[np.bool_], common_mm: float | None) -> Surface:
@@ -164,11 +197,11 @@ def _surface(grid: CloudGrid, mask: NDArray[np.bool_], common_mm: float | None) 
     check_part(part)
     common = COMMON_SHARE * float(np.median(part.sigma)) if common_mm is None else common_mm
     plane = fit_plane(part, common)
-    return Surface(mask, part, plane, flatness(part, plane), common)
+    return Surface(mask, part, plane, flatness(part, plane), common, part)
 
 
 def _pair(first: Surface, other: Surface) -> Pair:
-    gap, place = _joint(first.part, other.part)
+    gap, place = _joint(first.whole, other.whole)
     near, near_sigma = first.plane.range_at(*place)
     far, far_sigma = other.plane.range_at(*place)
     cosine = first.plane.cosine

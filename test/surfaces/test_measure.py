@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from grid_clouds import PITCH_Z, cloud
+from grid_clouds import PITCH_Y, PITCH_Z, cloud
 
 import eschorty_ros as es
 from eschorty_ros.cli import main
@@ -126,14 +126,30 @@ def test_surfaces_gap_step_and_flatness_are_found_without_regions():
     sign = 1.0 if found.surfaces[0].part.column.mean() < 200 else -1.0
     assert abs(pair.flush_mm.value - sign * 4.0) < 3.0 * pair.flush_mm.sigma + 0.1
     assert pair.flush_mm.sigma < 0.2
-    # The rims of automatic surfaces are 3 cells narrower on either side.
-    assert pair.gap_mm.value == pytest.approx(10.0 + 2 * 3 * PITCH_Z, abs=0.6)
+    # The rims that the planes leave out are part of the panels.
+    assert pair.gap_mm.value == pytest.approx(10.0, abs=0.4)
     flat = {surface.part.column.mean() < 200: surface.flat for surface in found.surfaces}
     assert 0.8 < flat[False].value_mm.value < 1.5
     assert flat[False].value_mm.value > 3.0 * flat[False].of_plane_mm
     assert flat[True].value_mm.value < 2.0 * flat[True].of_plane_mm
     regions = (parse_region("0:199,:"), parse_region("240:,:"))
     assert measure(cloud(panels), regions).pairs[0].gap_mm.value == pytest.approx(10.0, abs=0.4)
+
+
+@pytest.mark.parametrize("step_mm", [2.0, 4.0])
+@pytest.mark.parametrize(("axis", "gap_mm"), [("z", 0.0), ("z", 3.0), ("y", 0.0), ("y", 7.0)])
+def test_the_gap_of_surfaces_found_is_that_of_their_edges(step_mm, axis, gap_mm):
+    def panels(y, z):
+        place = z if axis == "z" else y - 15.0
+        behind = np.where(place < gap_mm, np.nan, 1300.0 + step_mm)
+        return np.where(place < 0.0, 1300.0, behind) + 0.0 * (y + z)
+
+    found = measure(cloud(panels))
+    assert len(found.surfaces) == 2
+    gap = found.pairs[0].gap_mm
+    # Each edge is anywhere within one pitch.
+    assert abs(gap.value - gap_mm) <= {"z": PITCH_Z, "y": PITCH_Y}[axis]
+    assert gap.sigma < 0.5
 
 
 def test_a_cloud_without_surfaces_and_bad_regions_have_one_line():
