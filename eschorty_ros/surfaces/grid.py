@@ -132,27 +132,53 @@ def _slopes(step: Array) -> Array:
     for begin in range(0, len(step), _LINES_AT_ONCE):
         part = padded[begin : begin + _LINES_AT_ONCE + 2 * half]
         windows = np.lib.stride_tricks.sliding_window_view(part, _SLOPE_WINDOW, axis=0)
-        # NaN is sorted to the end.
-        ordered = np.sort(windows, axis=-1)
-        middle = np.maximum(np.count_nonzero(ordered == ordered, axis=-1) - 1, 0) // 2
-        values = np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0]
-        slopes[begin : begin + _LINES_AT_ONCE] = values
+        slopes[begin : begin + _LINES_AT_ONCE] = _median(windows)
     return slopes
+
+
+def _median(values: Array) -> Array:
+    """Return the median of the known values along the last axis, NaN for none."""
+    # NaN is sorted to the end.
+    ordered = np.sort(values, axis=-1)
+    count = np.count_nonzero(ordered == ordered, axis=-1)[..., None]
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    middle = np.take_along_axis(ordered, low, -1) + np.take_along_axis(ordered, high, -1)
+    return np.asarray(0.5 * middle[..., 0])
 
 
 def smoothed(grid: CloudGrid, half: int) -> CloudGrid:
     """Return a grid with the median range of ``2 half + 1`` lines and columns, its sigma reduced.
 
-    The sigma is that of a median of independent Gaussian errors.
+    The median is that of the differences from the local slope: on steep surfaces the range itself
+    would be that of the middle line alone, and at rims that of a place beside. The sigma is that
+    of a median of independent Gaussian errors.
     """
-    from scipy.ndimage import median_filter, uniform_filter
-
     known = grid.known
+    values = np.where(known, grid.xyz[..., 0], np.nan)
+    down, across = (_tilts(values, axis) for axis in (0, 1))
     size = 2 * half + 1
-    # A missing neighbour counts as far away, on either side in turn, so that the median stays.
-    sign = np.where(np.indices(known.shape).sum(axis=0) % 2, np.inf, -np.inf)
-    middle = median_filter(np.where(known, grid.xyz[..., 0], sign), size)
-    count = np.maximum(uniform_filter(known.astype(np.float64), size) * size**2, 1.0)
-    xyz = grid.xyz.copy()
-    xyz[known, 0] = np.where(np.isfinite(middle[known]), middle[known], xyz[known, 0])
-    return grid._replace(xyz=xyz, sigma=grid.sigma * np.sqrt(np.pi / 2.0 / count))
+    places = np.arange(-half, half + 1.0)
+    padded = np.pad(values, half, constant_values=np.nan)
+    xyz, sigma = grid.xyz.copy(), grid.sigma.copy()
+    for begin in range(0, len(values), _LINES_AT_ONCE):
+        rows = slice(begin, begin + _LINES_AT_ONCE)
+        part = padded[begin : begin + _LINES_AT_ONCE + 2 * half]
+        level = np.lib.stride_tricks.sliding_window_view(part, (size, size))
+        level = level - down[rows, :, None, None] * places[:, None]
+        level -= across[rows, :, None, None] * places
+        level = level.reshape(*level.shape[:2], size * size)
+        xyz[rows, :, 0] = np.where(known[rows], _median(level), np.nan)
+        count = np.count_nonzero(level == level, axis=-1)
+        sigma[rows] *= np.sqrt(np.pi / 2.0 / np.maximum(count, 1))
+    return grid._replace(xyz=xyz, sigma=sigma)
+
+
+def _tilts(values: Array, axis: int) -> Array:
+    """Return the local slope of every cell along an axis, mm per cell; 0 where none is known."""
+    along = np.moveaxis(values, axis, 0)
+    tilts = np.zeros_like(along)
+    if len(along) > 1:
+        # Medians along and then across, as differences of two points are noisy.
+        tilts[:-1] = np.nan_to_num(_slopes(_slopes(np.diff(along, axis=0)).T).T)
+        tilts[-1] = tilts[-2]
+    return np.moveaxis(tilts, 0, axis)

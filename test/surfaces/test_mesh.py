@@ -48,6 +48,24 @@ def test_a_mesh_keeps_few_points_within_their_errors():
     assert area == pytest.approx(59 * PITCH_Y * (399 * PITCH_Z - 4.0), rel=0.05)
 
 
+@pytest.mark.parametrize(("down", "across"), [(1.5, 0.0), (0.0, 1.5), (2.5, 0.5)])
+def test_a_steep_plane_keeps_its_place_and_area_up_to_its_rims(down, across):
+    """With a round hole: its rim is one, too."""
+
+    def plane(y, z):
+        steep = 1300.0 + down * y + across * z
+        return np.where((y - 20.0) ** 2 + z**2 < 81.0, np.nan, steep)
+
+    made = mesh(cloud(plane, smooth=1))
+    x, y, z = made.vertices.T
+    assert np.abs(x - 1300.0 - down * y - across * z).max() < 3.0 * 0.17
+    corners = made.vertices[made.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    true_mm2 = (59 * PITCH_Y * 399 * PITCH_Z - np.pi * 81.0) * np.sqrt(1.0 + down**2 + across**2)
+    # The hole's edge is anywhere within one pitch.
+    assert 0.5 * np.linalg.norm(normal, axis=1).sum() == pytest.approx(true_mm2, rel=0.01)
+
+
 def test_what_cannot_be_meshed_has_one_line():
     points = cloud(ball)
     with pytest.raises(ArgumentError, match="allow more"):
