@@ -15,6 +15,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed
+from eschorty_ros.surfaces.plane import POINTS_MIN
 
 FORMATS = (".ply", ".obj", ".stl")
 _WITHIN = 0.95
@@ -34,6 +35,8 @@ class Level(NamedTuple):
     """Distance to the mesh within which 95 % of the cloud's points are."""
     error_sigmas: float
     """The same as a multiple of each point's own sigma."""
+    lost: int
+    """Largest group of neighbouring points beyond 5 sigma of its range, within for the finest."""
 
 
 class Mesh(NamedTuple):
@@ -44,7 +47,7 @@ class Mesh(NamedTuple):
     triangles: NDArray[np.int64]
     """Shape (m, 3). Their front faces the sensor."""
     levels: tuple[Level, ...]
-    """From the finest to the first one beyond the errors."""
+    """From the finest to the first one that is too coarse."""
     chosen: int
     """Index of the mesh's level."""
     points: int
@@ -55,7 +58,8 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0, progress: Progress | Non
     """Return the coarsest mesh from which 95 % of the points are within ``sigmas`` of their own.
 
     The finest mesh joins neighbours of the grid, at the median range of 5 by 5; none over a step
-    of the range. Each further level has half the triangles (Garland and Heckbert's quadrics).
+    of the range. Each further level has half the triangles (Garland and Heckbert's quadrics). A
+    level that loses points enough for a surface, such as those of a post, is too coarse.
 
     - ``points``: POINT_DTYPE, shape (n,).
     - ``sigmas``: Gaussian errors alone need 1.96.
@@ -79,13 +83,14 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0, progress: Progress | Non
         open3d.utility.Vector3iVector(place[triangles].astype(np.int32)),
     )
     finest = len(shape.triangles)
-    levels = [_level(open3d, shape, *measured)]
+    first, held = _level(open3d, shape, *measured)
+    levels = [first]
     if levels[0].error_sigmas > sigmas:
         raise ArgumentError(
             f"sigmas is {sigmas:g} and the finest mesh is {levels[0].error_sigmas:.2f} sigma from "
             "its points; allow more"
         )
-    chosen = shape
+    chosen, last = shape, 0
     while len(levels) < _LEVELS_MAX and levels[-1].triangles > _TRIANGLES_MIN:
         if progress is not None:
             halvings = [math.log2(finest / n) for n in (levels[-1].triangles, _TRIANGLES_MIN)]
@@ -93,11 +98,12 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0, progress: Progress | Non
         coarser = chosen.simplify_quadric_decimation(levels[-1].triangles // 2)
         if not 0 < len(coarser.triangles) < levels[-1].triangles:
             break
-        levels.append(_level(open3d, coarser, *measured))
-        if levels[-1].error_sigmas > sigmas:
+        level, near = _level(open3d, coarser, *measured)
+        level = level._replace(lost=_largest(grid.point.shape, used[held & ~near]))
+        levels.append(level)
+        if level.error_sigmas > sigmas or level.lost >= POINTS_MIN:
             break
-        chosen = coarser
-    last = len(levels) - 1 if levels[-1].error_sigmas <= sigmas else len(levels) - 2
+        chosen, last = coarser, len(levels) - 1
     return Mesh(
         np.asarray(chosen.vertices),
         np.asarray(chosen.triangles).astype(np.int64),
@@ -159,7 +165,18 @@ def _triangles(grid: CloudGrid, joined: Links) -> NDArray[np.int64]:
     return triangles if normal_x.sum() <= 0.0 else triangles[:, ::-1]
 
 
-def _level(open3d: Any, shape: Any, xyz: Array, sigma: Array) -> Level:
+def _largest(shape: tuple[int, ...], cells: NDArray[np.int64]) -> int:
+    """Return the number of cells, of flat indices, in the largest group of neighbours."""
+    from scipy.ndimage import label
+
+    inside = np.zeros(shape, bool)
+    inside.ravel()[cells] = True
+    groups, _ = label(inside, np.ones((3, 3)))
+    return int(np.bincount(groups[inside], minlength=1).max())
+
+
+def _level(open3d: Any, shape: Any, xyz: Array, sigma: Array) -> tuple[Level, NDArray[np.bool_]]:
+    """Return a level, none lost, and which points are within 5 sigma of its range."""
     # Its single precision has its digits near the origin.
     middle = xyz.mean(axis=0)
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
@@ -167,10 +184,16 @@ def _level(open3d: Any, shape: Any, xyz: Array, sigma: Array) -> Level:
         (np.asarray(shape.vertices) - middle).astype(np.float32),
         np.asarray(shape.triangles).astype(np.uint32),
     )
-    distance = scene.compute_distance((xyz - middle).astype(np.float32), nthreads=1).numpy()
-    return Level(
+    points = (xyz - middle).astype(np.float32)
+    off = scene.compute_closest_points(points, nthreads=1)["points"].numpy() - points
+    distance = np.linalg.norm(off, axis=1)
+    # The range alone: edges that retreat are no lost relief.
+    near = np.abs(off[:, 0]) <= STEP_SIGMAS * sigma
+    level = Level(
         len(shape.vertices),
         len(shape.triangles),
         float(np.quantile(distance, _WITHIN)),
         float(np.quantile(distance / sigma, _WITHIN)),
+        0,
     )
+    return level, near

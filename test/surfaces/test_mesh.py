@@ -12,6 +12,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import write_cloud
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.mesh import mesh
+from eschorty_ros.surfaces.plane import POINTS_MIN
 
 open3d = load_open3d("the test")
 
@@ -64,6 +65,19 @@ def test_a_steep_plane_keeps_its_place_and_area_up_to_its_rims(down, across):
     true_mm2 = (59 * PITCH_Y * 399 * PITCH_Z - np.pi * 81.0) * np.sqrt(1.0 + down**2 + across**2)
     # The hole's edge is anywhere within one pitch.
     assert 0.5 * np.linalg.norm(normal, axis=1).sum() == pytest.approx(true_mm2, rel=0.01)
+
+
+def test_a_post_of_few_points_stays_in_the_mesh():
+    """A post of 6 by 3 mm, 20 mm high, is 0.4 % of the points."""
+
+    def post(y, z):
+        return 1300.0 - 20.0 * ((np.abs(y - 20.0) < 3.0) & (np.abs(z) < 1.5))
+
+    made = mesh(cloud(post))
+    top = np.abs(made.vertices[made.triangles][:, :, 0] - 1280.0) < 1.0
+    assert top.all(axis=1).any()
+    assert made.levels[made.chosen].lost < POINTS_MIN <= made.levels[-1].lost
+    assert len(made.vertices) < 100
 
 
 def test_what_cannot_be_meshed_has_one_line():
