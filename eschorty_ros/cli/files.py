@@ -7,9 +7,20 @@ from pathlib import Path
 
 import click
 
+from eschorty_ros.core.base.errors import ArgumentError
+
 IN_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 OUT_FILE = click.Path(dir_okay=False, path_type=Path)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+def check_output(out: Path, *inputs: Path) -> None:
+    """Refuse an output that cannot be written, or that would replace a cloud it is made of."""
+    from eschorty_ros.core.base.files import check_writable
+
+    if out.exists() and any(out.samefile(path) for path in inputs):
+        raise ArgumentError(f"{out} is the cloud to read; choose another name for --out")
+    check_writable(out)
 
 
 def report_replaced(path: Path) -> None:

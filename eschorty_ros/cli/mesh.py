@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option
 from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
       eschorty mesh scan/scan.pcd
       eschorty mesh scan/scan.pcd --sigmas 1.9 --out part.stl
     """  # noqa: D301
-    from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage import read_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import mesh_figure
@@ -52,7 +51,7 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
 
     target = out or cloud.with_name(f"{cloud.stem}_mesh.ply")
     check_format(target)
-    check_writable(target)
+    check_output(target, cloud)
     with progress_bar("meshing") as report:
         made = mesh(read_cloud(cloud), sigmas, report)
     write_mesh(target, made)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option
 from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ def command(
       eschorty register forth.pcd back.pcd
       eschorty register front.pcd side.pcd --start 0 30 0 0 0 15 --out both.ply
     """  # noqa: D301
-    from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage import read_cloud, write_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import joined_figure
@@ -68,7 +67,7 @@ def command(
 
     if len(clouds) < 2 or len(starts) > len(clouds) - 1:
         raise click.UsageError("give two clouds or more, and at most one --start for each further")
-    check_writable(out)
+    check_output(out, *clouds)
     parts = [read_cloud(path) for path in clouds]
     joined, poses, sizes = parts[0], [], [len(parts[0])]
     with progress_bar("registering") as report:

@@ -108,3 +108,14 @@ def test_the_command_writes_a_mesh_that_open3d_reads(tmp_path, form):
     assert f"{target},{tmp_path / 'm.png'}:" in printed
     bad = CliRunner().invoke(main, [*arguments[:3], str(tmp_path / "m.xyz")])
     assert (bad.exit_code, bad.stdout) == (1, "")
+
+
+def test_a_cloud_is_not_replaced_by_its_mesh(tmp_path):
+    source = tmp_path / "c.ply"
+    write_cloud(source, cloud(ball))
+    before = source.read_bytes()
+    done = CliRunner().invoke(main, ["mesh", str(source), "--out", str(source)])
+    assert done.exit_code == 1
+    assert done.stderr.count("\n") == 1
+    assert f"{source} is the cloud to read; choose another name" in done.stderr
+    assert source.read_bytes() == before

@@ -122,6 +122,9 @@ def test_the_command_joins_clouds(tmp_path):
     assert len(read_cloud(out)) == facts["points"] == 48_000
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert CliRunner().invoke(main, arguments[:2]).exit_code == 2
+    replaced = CliRunner().invoke(main, [*arguments, "--out", arguments[2]])
+    assert "b.ply is the cloud to read" in replaced.stderr
+    assert len(read_cloud(arguments[2])) == 24_000
     printed = CliRunner().invoke(main, [*arguments, "--out", str(out)]).stdout
     assert "shift mm" in printed
     assert f"{out},{out.with_suffix('.png')}:" in "".join(printed.split())
