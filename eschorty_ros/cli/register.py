@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eschorty_ros.cli.console import progress_bar, show, table
+from eschorty_ros.cli.console import progress_bar, show, table, warn
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option
 from eschorty_ros.cli.options import Number
 
@@ -52,8 +52,10 @@ def command(
     """Bring CLOUDS (.pcd or .ply of this package) into the frame of the first; needs open3d.
 
     Each is registered against those before it by ICP with the points' own sigmas as weights.
-    Printed are its rotation, its shift at the middle of the overlap, both with sigma, and with
-    --json the transform in m and the covariance.
+    Printed are its rotation, its shift at the middle of the overlap, both with sigma, the distance
+    of its points from the others in sigmas (about 1 where they fit), and with --json the transform
+    in m and the covariance. --start turns about the sensor, not about the part, and then shifts:
+    15 degrees move a part at 1.3 m by 340 mm.
 
     \b
     Examples:
@@ -63,7 +65,7 @@ def command(
     from eschorty_ros.core.storage import read_cloud, write_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import joined_figure
-    from eschorty_ros.surfaces.register import join, pose_matrix, register
+    from eschorty_ros.surfaces.register import POOR_SIGMAS, join, pose_matrix, register
 
     if len(clouds) < 2 or len(starts) > len(clouds) - 1:
         raise click.UsageError("give two clouds or more, and at most one --start for each further")
@@ -78,6 +80,12 @@ def command(
 
             start = pose_matrix(starts[number]) if number < len(starts) else None
             pose = register(joined, part, start, reach_mm, progress)
+            if pose.rms_sigmas > POOR_SIGMAS:
+                warn(
+                    f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.1f} sigma (RMS) from "
+                    "the clouds before, where about 1 is right; check the picture, the start and "
+                    "that nothing moved"
+                )
             joined = join(joined, part, pose)
             poses.append(pose)
             sizes.append(len(part))
@@ -107,13 +115,14 @@ def _facts(path: Path, pose: Pose) -> dict[str, Any]:
 
 
 def _print(clouds: tuple[Path, ...], poses: list[Pose], title: str) -> None:
-    rows = table(title, "cloud", "", "x", "y", "z", "pairs", "overlap")
+    rows = table(title, "cloud", "", "x", "y", "z", "pairs", "overlap", "rms sigmas")
     for path, pose in zip(clouds, poses, strict=True):
         sigmas = pose.sigmas
         texts = [
             [f"{value:.3f} ± {sigma:.3f}" for value, sigma in zip(values, spread, strict=True)]
             for values, spread in ((pose.rotation_deg, sigmas[:3]), (pose.shift_mm, sigmas[3:]))
         ]
-        rows.add_row(path.name, "turn °", *texts[0], f"{pose.pairs:,}", f"{pose.overlap:.1%}")
-        rows.add_row("", "shift mm", *texts[1], "", "")
+        facts = f"{pose.pairs:,}", f"{pose.overlap:.1%}", f"{pose.rms_sigmas:.2f}"
+        rows.add_row(path.name, "turn °", *texts[0], *facts)
+        rows.add_row("", "shift mm", *texts[1], "", "", "")
     show(rows)

@@ -31,6 +31,8 @@ _NORMAL_NEIGHBOURS = 150
 # Of the noise alone; normals at a rim are one-sided, the same way in both clouds: spheres show 1.4
 # to 5.1, cones of 45 degrees up to 7.3.
 _RELIEF_MIN = 10.0
+# Clouds that fit show 0.9 to 1.0 sigma; those that stopped at a wrong pose 2.3 to 10.
+POOR_SIGMAS = 2.0
 _PERIODS_APART = 10
 _WITHOUT_PERIOD_S = 1.0
 
@@ -258,7 +260,8 @@ def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float
 
 
 def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> Pose:
-    _refuse_sliding(pairs.design, pairs.sigma, pairs.normal_noise)
+    rms_sigmas = float(np.sqrt(np.mean((pairs.residual / pairs.sigma) ** 2)))
+    _refuse_sliding(pairs, rms_sigmas)
     line, column = source.part.line[pairs.ours], source.part.column[pairs.ours]
     part = Part(line, column, pairs.moved, pairs.sigma)
     covariance = clustered_covariance(pairs.design, pairs.residual, part)
@@ -274,16 +277,26 @@ def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> 
         covariance,
         len(pairs.ours),
         pairs.overlap,
-        float(np.sqrt(np.mean((pairs.residual / pairs.sigma) ** 2))),
+        rms_sigmas,
     )
 
 
-def _refuse_sliding(design: Array, sigma: Array, normal_noise: float) -> None:
-    """Refuse surfaces on which the clouds slide or turn: their relief is noise of the normals."""
+def _refuse_sliding(pairs: _Pairs, rms_sigmas: float) -> None:
+    """Refuse surfaces on which the clouds slide or turn: their relief is noise of the normals.
+
+    At a wrong pose the normals differ as if they were noise.
+    """
+    design, sigma = pairs.design, pairs.sigma
     size = float(np.sqrt(np.mean(np.sum(design[:, :3] ** 2, axis=1)) / 2.0)) or 1.0
     scaled = design / np.array([size, size, size, 1.0, 1.0, 1.0]) / sigma[:, None]
     least, axes = np.linalg.eigh(scaled.T @ scaled)
-    if least[0] < _RELIEF_MIN * normal_noise**2 * float(np.sum(sigma**-2.0)):
+    if least[0] < _RELIEF_MIN * pairs.normal_noise**2 * float(np.sum(sigma**-2.0)):
+        if rms_sigmas > POOR_SIGMAS:
+            raise ArgumentError(
+                f"the clouds do not fit: {pairs.overlap:.0%} of the points overlap, "
+                f"{rms_sigmas:.1f} sigma from the first cloud; give a start nearer to the pose, "
+                "or a wider reach"
+            )
         loose = int(np.argmax(np.abs(axes[:, 0])))
         name = ("turns about x", "turns about y", "turns about z", "slides along x",
                 "slides along y", "slides along z")[loose]  # fmt: skip

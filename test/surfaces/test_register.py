@@ -100,6 +100,16 @@ def test_clouds_apart_are_refused_and_a_start_brings_them_together():
     assert len(lines) == 120
 
 
+def test_a_start_too_far_away_is_told_from_a_surface_without_relief():
+    """14 mm along z the waves meet others, 4 sigma from them at best."""
+    first, other = cloud(relief), cloud(relief, seed=2)
+    away = pose_matrix([0.0, 0.0, 14.0, 0.0, 0.0, 0.0])
+    with pytest.raises(
+        ArgumentError, match=r"do not fit: .* sigma from the first cloud; give a st"
+    ):
+        register(first, moved(other, away))
+
+
 def test_a_cloud_of_a_stage_at_rest_has_no_pose():
     first, line = cloud(relief), cloud(lambda y, z: relief(20.0, z) + 0.0 * y, seed=2)
     line["y"] = 20e-3
@@ -127,4 +137,5 @@ def test_the_command_joins_clouds(tmp_path):
     assert len(read_cloud(arguments[2])) == 24_000
     printed = CliRunner().invoke(main, [*arguments, "--out", str(out)]).stdout
     assert "shift mm" in printed
+    assert "rms sigmas" in printed
     assert f"{out},{out.with_suffix('.png')}:" in "".join(printed.split())
