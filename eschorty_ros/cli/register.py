@@ -62,6 +62,7 @@ def command(
       eschorty register forth.pcd back.pcd
       eschorty register front.pcd side.pcd --start 0 30 0 0 0 15 --out both.ply
     """  # noqa: D301
+    from eschorty_ros.core.base.errors import ArgumentError
     from eschorty_ros.core.storage import read_cloud, write_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import joined_figure
@@ -79,7 +80,11 @@ def command(
                 report((number + share) / (len(parts) - 1), clouds[number + 1].name)
 
             start = pose_matrix(starts[number]) if number < len(starts) else None
-            pose = register(joined, part, start, reach_mm, progress)
+            try:
+                pose = register(joined, part, start, reach_mm, progress)
+            except ArgumentError as error:
+                onto = ", ".join(str(path) for path in clouds[: number + 1])
+                raise ArgumentError(f"{clouds[number + 1]} onto {onto}: {error}") from error
             if pose.rms_sigmas > POOR_SIGMAS:
                 warn(
                     f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.1f} sigma (RMS) from "

@@ -127,7 +127,9 @@ def measure(
     masks, free = [_mask(grid, region) for region in regions], None
     if not masks:
         masks, free = _found(grid)
-    surfaces = tuple(_surface(grid, mask, common_mm) for mask in masks)
+    surfaces = tuple(
+        _surface(grid, mask, common_mm, f"surface {number}") for number, mask in enumerate(masks, 1)
+    )
     if free is not None:
         surfaces = _to_edges(grid, surfaces, free)
     pairs = tuple(_pair(surfaces[0], other) for other in surfaces[1:])
@@ -192,9 +194,11 @@ def _to_edges(
     return tuple(made)
 
 
-def _surface(grid: CloudGrid, mask: NDArray[np.bool_], common_mm: float | None) -> Surface:
+def _surface(
+    grid: CloudGrid, mask: NDArray[np.bool_], common_mm: float | None, name: str
+) -> Surface:
     part = Part.of(grid, mask)
-    check_part(part)
+    check_part(part, name)
     common = COMMON_SHARE * float(np.median(part.sigma)) if common_mm is None else common_mm
     plane = fit_plane(part, common)
     return Surface(mask, part, plane, flatness(part, plane), common, part)

@@ -192,19 +192,19 @@ def _spread(score: Array, group: NDArray[np.int64]) -> Array:
     return np.asarray(sums @ sums.T * (count / max(count - 2, 1)))
 
 
-def check_part(part: Part) -> None:
+def check_part(part: Part, name: str = "a surface") -> None:
     """Refuse points that are too few for a plane or on one line with an ArgumentError."""
     lines = len(np.unique(part.line))
     columns = len(np.unique(part.column))
     if len(part.line) < POINTS_MIN or lines < 3 or columns < 3:
         raise ArgumentError(
-            f"a surface has {len(part.line):,} points in {lines} periods and {columns} columns; "
+            f"{name} has {len(part.line):,} points in {lines} periods and {columns} columns; "
             f"choose a region with {POINTS_MIN} points or more in 3 of each"
         )
     extent_mm = np.ptp(part.xyz[:, 1:], axis=0)
     if extent_mm.min() < _EXTENT_MIN_MM:
         raise ArgumentError(
-            f"a surface extends {extent_mm[0]:.3g} mm along y and {extent_mm[1]:.3g} mm along z; "
+            f"{name} extends {extent_mm[0]:.3g} mm along y and {extent_mm[1]:.3g} mm along z; "
             "a plane needs an extent in both: give a sweep"
         )
 

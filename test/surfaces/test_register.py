@@ -132,6 +132,10 @@ def test_the_command_joins_clouds(tmp_path):
     assert len(read_cloud(out)) == facts["points"] == 48_000
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert CliRunner().invoke(main, arguments[:2]).exit_code == 2
+    write_cloud(tmp_path / "few.pcd", cloud(relief)[::900])
+    few = CliRunner().invoke(main, [*arguments[:2], str(tmp_path / "few.pcd"), "--out", str(out)])
+    assert (few.exit_code, few.stdout) == (1, "")
+    assert "few.pcd onto" in few.stderr.splitlines()[-1]
     replaced = CliRunner().invoke(main, [*arguments, "--out", arguments[2]])
     assert "b.ply is the cloud to read" in replaced.stderr
     assert len(read_cloud(arguments[2])) == 24_000
