@@ -120,14 +120,13 @@ def _facts(path: Path, pose: Pose) -> dict[str, Any]:
 
 
 def _print(clouds: tuple[Path, ...], poses: list[Pose], title: str) -> None:
-    rows = table(title, "cloud", "", "x", "y", "z", "pairs", "overlap", "rms sigmas")
+    rows = table(title, "cloud", "", "x", "y", "z", "pairs", "overlap")
     for path, pose in zip(clouds, poses, strict=True):
         sigmas = pose.sigmas
         texts = [
             [f"{value:.3f} ± {sigma:.3f}" for value, sigma in zip(values, spread, strict=True)]
             for values, spread in ((pose.rotation_deg, sigmas[:3]), (pose.shift_mm, sigmas[3:]))
         ]
-        facts = f"{pose.pairs:,}", f"{pose.overlap:.1%}", f"{pose.rms_sigmas:.2f}"
-        rows.add_row(path.name, "turn °", *texts[0], *facts)
-        rows.add_row("", "shift mm", *texts[1], "", "", "")
+        rows.add_row(path.name, "turn °", *texts[0], f"{pose.pairs:,}", f"{pose.overlap:.1%}")
+        rows.add_row("", "shift mm", *texts[1], "rms/sigma", f"{pose.rms_sigmas:.2f}")
     show(rows)

@@ -141,5 +141,5 @@ def test_the_command_joins_clouds(tmp_path):
     assert len(read_cloud(arguments[2])) == 24_000
     printed = CliRunner().invoke(main, [*arguments, "--out", str(out)]).stdout
     assert "shift mm" in printed
-    assert "rms sigmas" in printed
+    assert "rms/sigma" in printed
     assert f"{out},{out.with_suffix('.png')}:" in "".join(printed.split())
