@@ -103,6 +103,8 @@ DEVICES := $(addprefix test/,hardware nodes/laser nodes/stage)
 SCANS := $(addprefix test/nodes/,scanner test_hostile_messages.py)
 NODES := test/launch test/nodes
 REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS) $(NODES))
+# Threads of libraries that wait for each other by spinning take five times as long beside other work.
+test-pure test-devices test-scans test-nodes test-rest quick: export OMP_NUM_THREADS := 1
 test-%: run = pytest $(tests) -o cache_dir=$(BUILD)/$@
 test-devices: tests := $(DEVICES)
 test-scans: tests := $(SCANS)
