@@ -25,10 +25,12 @@ CALIBRATION = load_calibration("config_3")
 MODULATION = Modulation(70.0)
 
 
-def line(seed=3, offset_us=0, triggers_us=None):
-    """Bytes of 8 periods of a flat line at row 300, times shifted by ``offset_us``."""
+def line(seed=3, offset_us=0, triggers_us=None, periods=8):
+    """Bytes of a flat line at row 300, times shifted by ``offset_us``."""
     rng = np.random.default_rng(seed)
-    t, x, y, p = line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=EDGE_US)
+    t, x, y, p = line_events(
+        rng, lambda k, c: np.full(len(c), 300.0), periods=periods, edge_us=EDGE_US
+    )
     return encoded((t + offset_us, x, y, p), triggers_us)
 
 
@@ -150,14 +152,14 @@ def test_without_an_announcement_the_stamps_serve_and_the_phase_comes_from_the_e
 
 @AT_ONCE
 def test_gap_in_seq_is_counted_and_later_periods_are_the_plain_ones(at_once):
-    data = line()
+    data = line(periods=16)
     expected = plain(data)
     items = packets(data, size=20_000)
     subject = announced()
     seen = joined(run(subject, [*items[:2], *items[3:]], at_once=at_once))
     assert subject.packets_lost == 1
-    late = seen.edge_us >= EDGE_US + 5 * MODULATION.period_us
-    late_expected = expected.edge_us >= EDGE_US + 5 * MODULATION.period_us
+    late = seen.edge_us >= EDGE_US + 8 * MODULATION.period_us
+    late_expected = expected.edge_us >= EDGE_US + 8 * MODULATION.period_us
     assert late.any()
     np.testing.assert_array_equal(seen.edge_us[late], expected.edge_us[late_expected])
     # Not bit for bit: windows are seeded, and half widths chosen, by the profiles before.

@@ -284,14 +284,18 @@ def test_no_event_of_a_full_column_is_lost(camera, settings):
 
 
 def test_a_line_wider_than_the_limit_is_followed_with_a_warning():
-    camera = Camera(periods=12, half_width_px=29.0)
-    found, reconstructor = points(camera, camera.line(wavy), camera.scattered(1e6))
-    error = error_px(found)[found.period >= 5]
-    assert abs(error.mean()) < 0.05, f"seed {camera.seed}"
-    good = found.select((found.period >= 5) & (found.flags == 0))
-    assert 0.6 < np.mean(np.abs(error_px(good)) < good.sigma_row) < 0.76
-    (warning,) = reconstructor.warnings
-    assert "1.5 times as wide as line_width_px = 20" in warning
+    within = []
+    for seed in range(4):
+        camera = Camera(periods=12, half_width_px=29.0, seed=seed)
+        found, reconstructor = points(camera, camera.line(wavy), camera.scattered(1e6))
+        error = error_px(found)[found.period >= 5]
+        assert abs(error.mean()) < 0.05, f"seed {seed}"
+        good = found.select((found.period >= 5) & (found.flags == 0))
+        within.append(np.mean(np.abs(error_px(good)) < good.sigma_row))
+        (warning,) = reconstructor.warnings
+        assert "1.5 times as wide as line_width_px = 20" in warning
+    # The surface is as smooth as a few independent means: one seed scatters by 0.02.
+    assert 0.6 < np.mean(within) < 0.76
 
 
 @pytest.mark.parametrize("line_width_px", [3.0, 5.0, 8.0])
