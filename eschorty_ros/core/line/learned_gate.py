@@ -218,7 +218,8 @@ def _usual_late(columns, gate):
 def _learn_gate(columns, half, smoothing, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
-    A gate is chosen again when the line moves twice as fast, in profiles one after the other.
+    A gate is chosen again when the line moves twice as fast, in profiles one after the other, or
+    rests behind a leap.
     Returns true in the profile behind the one that changes the gate.
     """
     state = gate.state
@@ -227,8 +228,9 @@ def _learn_gate(columns, half, smoothing, gate):
     if state.known > 0:
         uses_gate = state.on_span != gate.choices[0].on_span
         faster = uses_gate and moving > max(2 * state.moving, _STILL)
+        rests = state.faster > 0 and not faster
         state.faster = state.faster + 1 if faster else 0
-        if state.faster < _FASTER_MIN:
+        if state.faster < _FASTER_MIN and not rests:
             return changed
         state.known = state.faster = 0
     if state.half > 0:

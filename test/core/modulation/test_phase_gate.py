@@ -264,18 +264,32 @@ def test_a_learned_gate_does_not_lag(
     assert median_mm[1] < worse * median_mm[0], "seed 0"
 
 
-def test_a_line_that_leaps_to_another_surface_keeps_its_gate_and_flags(tmp_path):
+def on_steps(folder, pixels):
+    """A sweep over steps, and the range errors without a gate and with one to be learned."""
     scene = named("steps")
     calibration = replace(CALIBRATION, columns=1280, principal_column=639.5)
     recording = simulate_recording(
-        tmp_path, scene, calibration, Modulation(70.0), 10.0, 70.0, 50.0, 0,
-        parameters=preset("noisy"),
+        folder, scene, calibration, Modulation(70.0), 10.0, 70.0, 50.0, 0,
+        parameters=preset(pixels),
     )  # fmt: skip
-    found = both(recording)[1]
+    found = both(recording)
+    errors_mm = []
+    for profiles in (part.profiles for part in found):
+        stage_mm = recording.stage.position_mm(profiles.t_us)
+        truth_mm = true_range_mm(scene, calibration.model(), stage_mm, profiles.column)
+        errors_mm.append(np.abs(profiles.range_mm - truth_mm))
+    return found, errors_mm
+
+
+def test_a_gate_is_chosen_again_where_the_line_rests_behind_a_leap(tmp_path):
+    _, (without, learned) = on_steps(tmp_path, "narrow")
+    assert np.median(learned) < 1.1 * np.median(without), "seed 0"
+
+
+def test_a_line_that_leaps_to_another_surface_keeps_its_gate_and_flags(tmp_path):
+    (_, found), (_, error_mm) = on_steps(tmp_path, "noisy")
     profiles = found.profiles
-    stage_mm = recording.stage.position_mm(profiles.t_us)
-    truth_mm = true_range_mm(scene, calibration.model(), stage_mm, profiles.column)
-    wrong = np.abs(profiles.range_mm - truth_mm) > 2.2
+    wrong = error_mm > 2.2
     flagged = np.mean(profiles.flags[wrong] > 0)
     print(f"seed 0: {flagged:.2f} of {wrong.sum()} wrong points have a flag")
     assert found.counters["events_gated"] > 0.1 * found.counters["events"]
