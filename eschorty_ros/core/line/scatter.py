@@ -39,8 +39,9 @@ _DIFFERENCES_MIN = 8.0
 _SMOOTHED_MIN = 12.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
-# Second differences of rows that are those of one pixel or the next: no edges of the surface.
-_PIXEL = 1.0
+# Square of the second difference of rows that are those of one pixel or the next: no edge of the
+# surface, px squared.
+_PIXEL2 = 1.0
 # Standard deviations beyond which a difference is an edge, or a neighbour is not averaged, and the
 # mean square of normal deviates within.
 _DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
@@ -135,7 +136,7 @@ def _add_differences(row, sigma2, variance, sums, ends):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
             square = (row[before] - 2.0 * row[c] + row[after]) ** 2
             expected2 = sigma2[before] + sigma2[after] + 4.0 * sigma2[c]
-            largest2 = max(_PIXEL, _DEVIATIONS_MAX**2 * ratio * expected2)
+            largest2 = max(_PIXEL2, _DEVIATIONS_MAX**2 * ratio * expected2)
             if square <= largest2:
                 squares += square
                 expected += expected2
