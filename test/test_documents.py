@@ -27,8 +27,9 @@ PAGES = (README, *sorted((ROOT / "docs").glob("*.md")))
 # One after the other in one folder: a page may use what one before it has made.
 RUN = [
     README if name == "README" else ROOT / "docs" / f"{name}.md"
-    for name in ("README", "tutorial", "gallery", "clouds", "recordings", "calibration", "design")
-]
+    for name in ("README", "tutorial", "gallery", "clouds", "recordings", "calibration", "design",
+                 "development")
+]  # fmt: skip
 # Only their options are checked here; the tests named run them.
 ELSEWHERE = (
     "eschorty scan",  # the nodes: test/cli/test_scan_command.py
@@ -40,7 +41,7 @@ ELSEWHERE = (
 )  # fmt: skip
 # They change the computer or are other programs' own, so that no test runs them.
 NOT_RUN = {
-    "sudo", "export", "for", "do", "done", "colcon", "source", ".", "python3",
+    "sudo", "export", "for", "do", "done", "colcon", "source", ".", "python3", "cmp",
     "EVENTS=qos_overrides./eschorty/camera/events",
 }  # fmt: skip
 SHORT = {"simulate": {"stop": 18.0}}
