@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
-from eschorty_ros.core.line.line_history import RECENT_PROFILES
+from eschorty_ros.core.line.line_history import RECENT_PROFILES, _has_one_polarity
 from eschorty_ros.core.line.window import (
     _ONE,
     _ONE_BITS,
@@ -130,13 +130,18 @@ def _difference(bursts, block, polarity, explained_px):
 
 @kernel(_nrt=False)
 def _points_followed(history):
-    """Return the points where the sums are of enough profiles, and how many have a shift."""
-    followed, shifted = 0.0, 0.0
-    for block in range(history.shift_px.size):
+    """Return the points where the sums are of enough profiles.
+
+    Besides, how many of them have a shift, and how many are of events of one polarity.
+    """
+    followed, shifted, of_one = 0.0, 0.0, 0.0
+    for block in range(1, history.shift_px.size - 1):
         if history.recent.profiles[block] >= RECENT_PROFILES:
-            followed += history.now.points[block]
-            shifted += history.now.points[block] if history.shift_px[block] > 0.0 else 0.0
-    return np.int64(followed), np.int64(shifted)
+            points = history.now.points[block]
+            followed += points
+            shifted += points if history.shift_px[block] > 0.0 else 0.0
+            of_one += points if _has_one_polarity(history.polarities, block) else 0.0
+    return np.int64(followed), np.int64(shifted), np.int64(of_one)
 
 
 @kernel(_nrt=False)

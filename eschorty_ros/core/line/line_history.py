@@ -4,7 +4,8 @@ A line whose rows are where they were has the same error in all profiles. One th
 a part of a row, as pixels remember where it was, in all columns alike: they give ON events ahead of
 its centre and OFF events behind it. Where both are as far, the line is in the middle of their two
 rows. The mean of all events is nearer to the kind with more of them, and its distance from the
-middle is its uncertainty, up to the displacement of the line from profile to profile.
+middle is its uncertainty, up to the displacement of the line from profile to profile, which is that
+of events of one kind alone.
 
 Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
 Minus their mean product is the variance of the jumps; a steady displacement has none.
@@ -157,6 +158,12 @@ def _compare_polarities(columns, half, first, history):
 
 
 @kernel(_nrt=False)
+def _has_one_polarity(polarities, block):
+    """Return whether no column near a block has had events of both polarities."""
+    return _near_sum(polarities.all_columns, block) == 0.0
+
+
+@kernel(_nrt=False)
 def _compare_with_recent(history, known, usual, width_variance):
     """Compare the sums of a profile with recent profiles, and add them.
 
@@ -183,11 +190,12 @@ def _compare_with_recent(history, known, usual, width_variance):
         if profiles > 1.0:
             # The mean of recent rows follows the line by as much as it moves from one to the next.
             history.step_px[block] = weight * abs(moved) if moved2 > 0.0 else 0.0
-            compared = 0
-            for other in range(block - 1, block + 2):
-                compared += polarities.columns[other] > 0.0
-            apart = abs(_near_sum(polarities.row, block)) / max(compared, 1)
-            apart = min(apart, history.step_px[block])
+            apart = history.step_px[block]
+            if not _has_one_polarity(polarities, block):
+                compared = 0
+                for other in range(block - 1, block + 2):
+                    compared += polarities.columns[other] > 0.0
+                apart = min(apart, abs(_near_sum(polarities.row, block)) / max(compared, 1))
             off2 = history.common_px**2 + apart * apart
             shift_px = history.shift_px[block]
             history.moved2[block] = min(max(moved2, 0.0), off2) + shift_px * shift_px

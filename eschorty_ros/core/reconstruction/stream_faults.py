@@ -72,7 +72,13 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
             f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
         )
     share = counts["points_burst_shift"] / max(counts["points_followed"], 1)
-    if share > _BURST_SHIFT_SHARE:
+    if 2 * counts["points_one_polarity"] > counts["points_followed"]:
+        found.append(
+            "the line has events of one polarity alone: where it moves, its rows are ahead (ON) or "
+            "behind (OFF) by up to its width, and sigma has its displacement per profile only; let "
+            "the camera send both (bias_diff_on, bias_diff_off)"
+        )
+    elif share > _BURST_SHIFT_SHARE:
         found.append(
             f"early and late events of a burst have different rows in {share:.0%} of the "
             "points: the readout loses one side of the line, or the line is lopsided; sigma "

@@ -19,6 +19,7 @@ from eschorty_ros.core.reconstruction import (
     reconstruct_recording,
 )
 from eschorty_ros.core.storage import SENSOR_EDGE
+from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.report.accuracy import true_range_mm
 from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
@@ -496,6 +497,26 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
     assert np.mean(error < 2.0 * found.sigma_row) > 0.5
     (warning,) = reconstructor.warnings
     assert "the readout loses one side of the line" in warning
+    assert len(warning) < 300
+
+
+@pytest.mark.parametrize("polarity", [0, 1])
+def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger_sigma(
+    polarity, tmp_path
+):
+    scene = named("tilted", MODEL)
+    recording = simulate_recording(
+        tmp_path, scene, CALIBRATION, Modulation(70.0), 10.0, 100.0, 300.0, 1
+    )
+    events = Decoder().decode(b"".join(RawReader(recording.events_path).mapped(1 << 20)))
+    one = (values[events.p == polarity] for values in (events.t, events.x, events.y, events.p))
+    found, reconstructor = reconstruct(stream(tuple(one)), recording.modulation, Settings())
+    stage_mm = recording.stage.position_mm(found.t_us)
+    truth_mm = true_range_mm(scene, MODEL, stage_mm, found.column)
+    error_px = np.abs(found.row - MODEL.row(truth_mm, found.column))
+    assert np.nanmean(error_px < 2.0 * found.sigma_row) > 0.8, "seed 1"
+    (warning,) = reconstructor.warnings
+    assert "events of one polarity alone" in warning
     assert len(warning) < 300
 
 
