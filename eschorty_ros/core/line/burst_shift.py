@@ -5,7 +5,8 @@ fewer events than the pixels give, and loses them in the order of the rows, thos
 the burst have lost one side of the line, and the later ones have not. What the bursts of both
 polarities show is an uncertainty of the row; one of them alone differs where pixels answer the two
 edges of the laser differently. A line that passes an edge has lost one side, too, but not to the
-readout: the sums start again behind the edge.
+readout: the sums start again behind the edge. Early events of a line that moves are ahead of the
+late ones, as pixels that were lit before answer later, which is an uncertainty but no fault.
 """
 
 from __future__ import annotations
@@ -132,14 +133,17 @@ def _difference(bursts, block, polarity, explained_px):
 def _points_followed(history):
     """Return the points where the sums are of enough profiles.
 
-    Besides, how many of them have a shift, and how many are of events of one polarity.
+    Besides, how many of them have a shift that is not in the direction of the line's motion, and
+    how many are of events of one polarity.
     """
     followed, shifted, of_one = 0.0, 0.0, 0.0
     for block in range(1, history.shift_px.size - 1):
         if history.recent.profiles[block] >= RECENT_PROFILES:
             points = history.now.points[block]
             followed += points
-            shifted += points if history.shift_px[block] > 0.0 else 0.0
+            step_px = history.recent.last[block] - history.recent.row[block]
+            ahead = history.step_px[block] > 0.0 and history.shift_px[block] * step_px > 0.0
+            shifted += points if history.shift_px[block] != 0.0 and not ahead else 0.0
             of_one += points if _has_one_polarity(history.polarities, block) else 0.0
     return np.int64(followed), np.int64(shifted), np.int64(of_one)
 
@@ -196,7 +200,7 @@ def _compare_bursts(columns, half, profiles, blink, common2, bursts, history):
         explained_px = history.step_px[block] + _EXPLAINED * np.sqrt(common2[c])
         on = _difference(bursts, block, 1, explained_px)
         off = _difference(bursts, block, 0, explained_px)
-        shift_px[block] = min(abs(on), abs(off)) if on * off > 0.0 else 0.0
+        shift_px[block] = np.sign(on) * min(abs(on), abs(off)) if on * off > 0.0 else 0.0
         products += on * off
         squares += (on * off) ** 2
         blocks += 1

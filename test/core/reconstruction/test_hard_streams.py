@@ -500,6 +500,13 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
     assert len(warning) < 300
 
 
+def test_a_line_that_moves_at_1_khz_is_no_fault_of_the_readout(tmp_path):
+    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    scene, sweep = named("face", narrow.model()), (40.0, 44.0, 100.0)
+    recording = simulate_recording(tmp_path, scene, narrow, Modulation(1000.0), *sweep, 1)
+    assert reconstruct_recording(recording).warnings == (), "seed 1"
+
+
 @pytest.mark.parametrize("polarity", [0, 1])
 def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger_sigma(
     polarity, tmp_path
