@@ -49,10 +49,9 @@ class Modulation:
 
     def __post_init__(self) -> None:
         # Numbers of numpy are taken, too.
-        object.__setattr__(self, "duty", float(number("duty", self.duty)))
-        frequency_hz = float(number("frequency_hz", self.frequency_hz))
-        object.__setattr__(self, "frequency_hz", frequency_hz)
-        if not FREQUENCY_MIN_HZ <= frequency_hz <= FREQUENCY_MAX_HZ:
+        for name in ("duty", "frequency_hz"):
+            object.__setattr__(self, name, number(name, getattr(self, name)))
+        if not FREQUENCY_MIN_HZ <= self.frequency_hz <= FREQUENCY_MAX_HZ:
             raise ArgumentError(
                 f"frequency_hz is {self.frequency_hz!r}; "
                 f"choose {FREQUENCY_MIN_HZ:g} to {FREQUENCY_MAX_HZ:g} Hz"
@@ -61,7 +60,7 @@ class Modulation:
             raise ArgumentError(f"duty is {self.duty!r}; choose a value between 0 and 1")
         if self.on_edge_us is not None:
             on_edge_us = integer("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
-            object.__setattr__(self, "on_edge_us", int(on_edge_us))
+            object.__setattr__(self, "on_edge_us", on_edge_us)
         if self.waveform not in WAVEFORMS:
             raise ArgumentError(
                 f"waveform is {short(self.waveform)}; choose one of {', '.join(WAVEFORMS)}"
