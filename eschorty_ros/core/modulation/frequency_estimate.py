@@ -115,25 +115,22 @@ class FrequencyEstimate:
         low = max(round(0.9 * FREQUENCY_MIN_HZ / step_hz), 1)
         high = round(FREQUENCY_MAX_HZ / step_hz)
         strongest = float(power[low:high].max())
-        if strongest < _LINE_MIN * float(np.median(power[low:high])):
+        noise = _LINE_MIN * float(np.median(power[low:high]))
+        if strongest < noise:
             return None
+        reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
 
         def highest(from_hz: float, to_hz: float) -> float:
             near = power[max(int(from_hz / step_hz), 0) : int(to_hz / step_hz) + 2]
             return float(near.max(initial=0.0))
 
-        def strong(frequency_hz: float) -> bool:
-            reach_hz = _TURNS_MAX / span_s
-            near = highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
-            return near >= _STRONG * strongest
+        def at_line(frequency_hz: float) -> float:
+            return highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
 
         def stands_out(frequency_hz: float) -> bool:
-            reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
-            near = highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
             below = highest(frequency_hz - outer_hz, frequency_hz - inner_hz)
             above = highest(frequency_hz + inner_hz, frequency_hz + outer_hz)
-            noise = _LINE_MIN * float(np.median(power[low:high]))
-            return near >= max(noise, _BESIDE_MIN * max(below, above))
+            return at_line(frequency_hz) >= max(noise, _BESIDE_MIN * max(below, above))
 
         peak = low + int(np.argmax(power[low:high] >= _STRONG * strongest))
         while power[peak + 1] > power[peak]:
@@ -143,13 +140,14 @@ class FrequencyEstimate:
         if found_hz * span_s < _TURNS_MIN:
             return None
         apart_hz = abs(expected_hz - found_hz)
-        tolerance_hz = max(_TURNS_MAX / span_s, _CLOCKS_MAX * expected_hz)
+        tolerance_hz = max(reach_hz, _CLOCKS_MAX * expected_hz)
         if apart_hz <= tolerance_hz:
             return expected_hz
-        if apart_hz <= _LOBE / span_s or not stands_out(expected_hz):
+        if apart_hz <= inner_hz or not stands_out(expected_hz):
             return found_hz
         # Another light may blink as well: then the multiples between the two are weak.
         multiple = round(expected_hz / found_hz)
         of_found = abs(expected_hz - multiple * found_hz) <= multiple * tolerance_hz
-        between = all(strong(order * found_hz) for order in range(2, multiple))
+        strong = _STRONG * strongest
+        between = all(at_line(order * found_hz) >= strong for order in range(2, multiple))
         return found_hz if of_found and between else expected_hz
