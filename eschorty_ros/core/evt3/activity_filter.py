@@ -16,6 +16,7 @@ from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, _first_fall, event_arrays
+from eschorty_ros.core.evt3.words import ADDRESSES
 
 _COLUMN_BITS = 3
 _ROW_BITS = 2
@@ -43,10 +44,9 @@ class ActivityFilter:
     """
 
     def __init__(self, width: int = 1280, height: int = 720, window_us: int = 500) -> None:
-        for name, size in (("width", width), ("height", height)):
-            integer(name, size, 1, 2048)
-        integer("window_us", window_us, 1, _WINDOW_MAX_US)
-        self.width, self.height, self.window_us = int(width), int(height), int(window_us)
+        self.width = integer("width", width, 1, ADDRESSES)
+        self.height = integer("height", height, 1, ADDRESSES)
+        self.window_us = integer("window_us", window_us, 1, _WINDOW_MAX_US)
         # One cell of border on each side, so that no neighbour needs a check.
         self._pitch = ((self.width + 7) >> _COLUMN_BITS) + 2
         self._buffers = event_arrays(0)

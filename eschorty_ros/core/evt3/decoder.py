@@ -53,10 +53,8 @@ class Decoder:
     """
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
-        for name, size in (("width", width), ("height", height)):
-            integer(name, size, 1, w3.ADDRESSES)
-        self.width = int(width)
-        self.height = int(height)
+        self.width = integer("width", width, 1, w3.ADDRESSES)
+        self.height = integer("height", height, 1, w3.ADDRESSES)
         self._events = event_arrays(0)
         self._numbers = np.zeros(len(_STATE) + len(COUNTS), np.int64)
         self._state = record(*_STATE, numbers=self._numbers[: len(_STATE)])

@@ -42,10 +42,8 @@ class Encoder:
     """
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
-        for name, size in (("width", width), ("height", height)):
-            integer(name, size, 1, w3.ADDRESSES)
-        self.width = int(width)
-        self.height = int(height)
+        self.width = integer("width", width, 1, w3.ADDRESSES)
+        self.height = integer("height", height, 1, w3.ADDRESSES)
         self._state = record(*_STATE, value=_NONE)
         self._state["width"] = self.width
         self._words = np.empty(0, dtype="<u2")
@@ -61,10 +59,10 @@ class Encoder:
         x: ArrayLike,
         y: ArrayLike,
         p: ArrayLike,
-        trigger_t: ArrayLike | None = None,
-        trigger_edge: ArrayLike | None = None,
-        drop_t: ArrayLike | None = None,
-        rate_counts: ArrayLike | None = None,
+        trigger_t: ArrayLike = (),
+        trigger_edge: ArrayLike = (),
+        drop_t: ArrayLike = (),
+        rate_counts: ArrayLike = (),
     ) -> bytes:
         """Return the bytes of the next events, triggers and notes of dropped events.
 
@@ -84,12 +82,8 @@ class Encoder:
         columns = integer_vector("x", x, np.uint16, 0, self.width - 1)
         rows = integer_vector("y", y, np.uint16, 0, self.height - 1)
         polarities = integer_vector("p", p, np.uint8, 0, 1)
-        trigger_times = integer_vector(
-            "trigger_t", () if trigger_t is None else trigger_t, np.int64, 0, _T_MAX
-        )
-        edges = integer_vector(
-            "trigger_edge", () if trigger_edge is None else trigger_edge, np.uint8, 0, 1
-        )
+        trigger_times = integer_vector("trigger_t", trigger_t, np.int64, 0, _T_MAX)
+        edges = integer_vector("trigger_edge", trigger_edge, np.uint8, 0, 1)
         if not times.size == columns.size == rows.size == polarities.size:
             raise ArgumentError(
                 f"t, x, y, p have {times.size}, {columns.size}, {rows.size}, {polarities.size} "
@@ -100,7 +94,7 @@ class Encoder:
                 f"trigger_t has {trigger_times.size} entries and trigger_edge {edges.size}; "
                 "give one edge per trigger"
             )
-        drop_times = integer_vector("drop_t", () if drop_t is None else drop_t, np.int64, 0, _T_MAX)
+        drop_times = integer_vector("drop_t", drop_t, np.int64, 0, _T_MAX)
         report_times, counts = _reports(rate_counts)
         for name, series in (
             ("t", times),
@@ -157,9 +151,9 @@ class Encoder:
         return (end_us >> 12) - (begun_us >> 12) + 1
 
 
-def _reports(rate_counts: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _reports(rate_counts: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return times of the rate control's reports, and per report the events before and after it."""
-    given = np.asarray(() if rate_counts is None else rate_counts)
+    given = np.asarray(rate_counts)
     if given.size == 0:
         return np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
     if given.ndim != 2 or given.shape[1] != 3:
