@@ -9,11 +9,10 @@ import stat
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
-from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
 from eschorty_ros.core.base.numbers import file_path, short
 
 _PARTIAL = ".eschorty-partial"
@@ -135,18 +134,49 @@ def temporary_folder() -> Iterator[Path]:
         yield folder
 
 
-def append_whole(file: FileIO, data: bytes | memoryview) -> None:
-    """Append all of ``data`` to an unbuffered file, or raise ``OSError`` and append nothing."""
-    end, view = file.tell(), memoryview(data)
-    try:
-        while view:
-            view = view[file.write(view) :]
-    except OSError:
-        # The disk may be gone.
-        with suppress(OSError):
-            file.truncate(end)
-            file.seek(end)
-        raise
+class GrowingFile:
+    """A new file that grows by all of the data of a call, or by nothing.
+
+    - ``path``: Replaced when it exists.
+
+    Raises ``FormatError`` when it cannot be written; names the path and the reason.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise FormatError(f"{path}: {error.strerror or error}; choose another") from error
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Append ``data``; they stay there also when the process is killed."""
+        end, view = self._file.tell(), memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            # The disk may be gone.
+            with suppress(OSError):
+                self._file.truncate(end)
+                self._file.seek(end)
+            raise self._full(error) from error
+
+    def close(self) -> None:
+        """Finish the file; idempotent."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._full(error) from error
+
+    def _full(self, error: OSError) -> FormatError:
+        return FormatError(f"{self.path}: {error.strerror or error}; free some space")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def remove_abandoned(parent: Path, prefix: str = ".", suffix: str = _PARTIAL) -> None:

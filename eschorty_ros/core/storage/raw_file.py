@@ -15,7 +15,7 @@ from pathlib import Path
 
 from eschorty_ros.core.base.arrays import byte_view, file_path, integer
 from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.base.files import append_whole, open_regular_file
+from eschorty_ros.core.base.files import GrowingFile, open_regular_file
 from eschorty_ros.core.evt3 import words as w3
 
 CHUNK_BYTES = 128 * 1024
@@ -216,25 +216,20 @@ class RawReader:
         return width, height
 
 
-class RawWriter:
+class RawWriter(GrowingFile):
     """Writes an EVT3 RAW file with the header keys that older and newer readers need.
 
-    - ``path``: The file to write; replaced when it exists.
+    - ``path``: Replaced when it exists.
     - ``width``, ``height``: Sensor size in pixels.
 
     Raises ``ArgumentError`` for a size that is none. Raises ``FormatError`` when
     the file cannot be written.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        width: int = 1280,
-        height: int = 720,
-    ) -> None:
+    def __init__(self, path: str | Path, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
             integer(name, size, 1, _SIZE_MAX)
-        self.path = file_path("path", path)
+        super().__init__(file_path("path", path))
         self.bytes_written = 0
         header = {
             "camera_integrator_name": "Prophesee",
@@ -252,34 +247,10 @@ class RawWriter:
             "system_ID": "49",
         }
         lines = "".join(f"% {key} {value}\n" for key, value in header.items()) + "% end\n"
-        try:
-            self._file = self.path.open("wb", buffering=0)
-            append_whole(self._file, lines.encode("ascii"))
-        except OSError as error:
-            raise FormatError(f"{self.path}: {error.strerror or error}; choose another") from error
+        super().write(lines.encode("ascii"))
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append bytes of the stream; raises ``FormatError`` when they cannot be written.
-
-        Either all of ``data`` is in the file afterwards, also when the process is killed, or the
-        file ends where it ended before.
-        """
+        """Append bytes of the stream, all or none."""
         view = byte_view("data", data)
-        try:
-            append_whole(self._file, view)
-        except OSError as error:
-            raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
+        super().write(view)
         self.bytes_written += len(view)
-
-    def close(self) -> None:
-        """Finish the file; idempotent. Raises ``FormatError`` when it cannot be written."""
-        try:
-            self._file.close()
-        except OSError as error:
-            raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
-
-    def __enter__(self) -> RawWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

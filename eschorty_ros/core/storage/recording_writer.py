@@ -13,8 +13,8 @@ import yaml
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import file_path
-from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.files import append_whole, atomic_write
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import GrowingFile, atomic_write
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, save_calibration
 from eschorty_ros.core.storage.cloud import Points, write_cloud
@@ -95,12 +95,12 @@ class RecordingWriter:
         """Note lost packets, or that the laser was switched on, before the next ``events``."""
         assert self._marks is not None
         row = np.array([(self.event_bytes, packets_lost, laser_on)], MARK_DTYPE)
-        self._marks.append(row)
+        self._marks.write(csv_lines(row))
 
     def stage(self, t_us: int, position_mm: float) -> None:
         """Append a stage sample; one that is not later than the one before is left out."""
         if self._stage_us is None or t_us > self._stage_us:
-            self._stage.append(np.array([(t_us, position_mm)], STAGE_DTYPE))
+            self._stage.write(csv_lines(np.array([(t_us, position_mm)], STAGE_DTYPE)))
             self._stage_us = t_us
 
     def replace_stage(self, samples: NDArray[np.void]) -> None:
@@ -123,35 +123,10 @@ class RecordingWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _table(self, dtype: np.dtype[Any], name: str) -> _Table:
-        return self._files.enter_context(_Table(self.path / name, dtype))
-
-
-class _Table:
-    """A CSV file that grows by whole lines."""
-
-    def __init__(self, path: Path, dtype: np.dtype[Any]) -> None:
-        self._path = path
-        try:
-            self._file = path.open("wb", buffering=0)
-        except OSError as error:
-            raise FormatError(f"{path}: {error.strerror or error}; choose another") from error
-        self._write(csv_header(dtype))
-
-    def append(self, rows: NDArray[np.void]) -> None:
-        self._write(csv_lines(rows))
-
-    def _write(self, text: bytes) -> None:
-        try:
-            append_whole(self._file, text)
-        except OSError as error:
-            raise FormatError(f"{self._path}: {error.strerror or error}; free some space") from None
-
-    def __enter__(self) -> _Table:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+    def _table(self, dtype: np.dtype[Any], name: str) -> GrowingFile:
+        table = self._files.enter_context(GrowingFile(self.path / name))
+        table.write(csv_header(dtype))
+        return table
 
 
 def make_recording_folder(folder: Path) -> None:
