@@ -110,7 +110,7 @@ def _part(first, last, rest, cost):
 
 
 @kernel
-def _gap(value, per_level, noise, per_noise, sign):
+def _gap(value, per_level, per_noise, sign):
     """Return the distance of y from a level in standard deviations, positive inside the band.
 
     ``log(1 + x) / noise`` by its series, which is accurate near the level and grows far from it.
@@ -177,7 +177,7 @@ def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
     for _ in range(_STEPS_MAX):
         sign = 1.0 if value < middle else -1.0
         per_level = per_on if value < middle else per_off
-        gap = _gap(value, per_level, noise, per_noise, sign)
+        gap = _gap(value, per_level, per_noise, sign)
         entry = _entry(gap)
         if old_sign != 0.0:
             if sign != old_sign:
@@ -192,7 +192,7 @@ def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
         scale = value * noise
         if abs(a) + abs(b) < 0.05 * scale:
             per_other = per_off if value < middle else per_on
-            other = _entry(_gap(value, per_other, noise, per_noise, -sign))
+            other = _entry(_gap(value, per_other, per_noise, -sign))
             rate = table[entry, _RATE] + table[other, _RATE]
             if rate == 0.0:
                 return np.inf, NOTHING

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel
+from eschorty_ros.core.evt3 import EventArrays
 from eschorty_ros.simulation.pixels._passage import DECISION_US, noise_table
 from eschorty_ros.simulation.pixels._pixel import (
     FULL,
@@ -256,12 +257,8 @@ class PixelArray:
         self._keys[: left.size] = left
         self._count = left.size
         taken.sort()
-        if taken.size:
-            fresh = np.empty(taken.size, dtype=bool)
-            fresh[0] = True
-            np.not_equal(taken[1:], taken[:-1], out=fresh[1:])
-            taken = taken[fresh]
-        return taken
+        # np.unique hashes and is ten times slower here.
+        return taken[np.append(True, taken[1:] != taken[:-1])[: taken.size]]
 
     def _grow(self) -> None:
         self._keys = np.concatenate((self._keys, np.empty_like(self._keys)))
@@ -290,11 +287,9 @@ def _at_rest(shape: tuple[int, int], background_intensity: float) -> NDArray[np.
     return pixels
 
 
-def unpack(
-    keys: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
-    """Return event keys as t (us), x, y, p."""
-    return (
+def unpack(keys: NDArray[np.int64]) -> EventArrays:
+    """Return the events of keys."""
+    return EventArrays(
         keys >> T_SHIFT,
         (keys & 0x7FF).astype(np.uint16),
         ((keys >> 12) & 0x3FF).astype(np.uint16),
