@@ -57,7 +57,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     stages = stage_mm + _SAMPLES * half_mm
     range_mm = scene.range_mm(stages, columns, model)
     reflectance = scene.reflectance(stages, columns, model)
-    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
+    row = model.row(range_mm, columns)
     step = _jumps(row, reflectance)
     # The edge next to the middle, of the four stretches between samples.
     order = np.array([1, 2, 0, 3])
@@ -122,7 +122,7 @@ def _edges(
     """
     stages = np.linspace(stretch[0], stretch[1], _FINE + 1)
     range_mm = scene.range_mm(stages, columns, model)
-    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
+    row = model.row(range_mm, columns)
     reflectance = scene.reflectance(stages, columns, model)
     each = np.arange(columns.size)
     lit = np.isfinite(row)
