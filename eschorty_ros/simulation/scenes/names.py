@@ -15,8 +15,6 @@ from eschorty_ros.simulation.scenes.scene import Scene
 from eschorty_ros.simulation.scenes.surfaces import Plane, Sphere, Steps
 from eschorty_ros.simulation.scenes.within_range import within_range
 
-__all__ = ["NAMES", "RECEDING_MM", "Plane", "Scene", "Sphere", "Steps", "named"]
-
 RECEDING_MM = 900.0
 """Range of the scene ``receding`` with the stage at 0."""
 
