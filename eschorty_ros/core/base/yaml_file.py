@@ -7,13 +7,14 @@ referred to twice, carry a tag or grow beyond what the file holds.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import yaml
 
 from eschorty_ros.core.base.errors import EschortyError
-from eschorty_ros.core.base.files import read_regular_file
+from eschorty_ros.core.base.files import atomic_write, read_regular_file
 from eschorty_ros.core.base.numbers import short
 
 BYTES_MAX = 65_536
@@ -82,6 +83,15 @@ def parse_yaml(data: bytes, path: str | os.PathLike[str], error: type[EschortyEr
     else:
         return Document(os.fspath(path), builder.data, builder.lines)
     raise error(f"{path} line {line + 1}: {reason}; correct the YAML")
+
+
+def write_yaml(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
+    """Write a YAML file atomically, the keys in their order.
+
+    Raises ``ArgumentError`` when the path cannot be written.
+    """
+    with atomic_write(path) as stream:
+        stream.write(yaml.safe_dump(dict(data), sort_keys=False).encode())
 
 
 class _Refused(Exception):  # noqa: N818 - leaves this file as the caller's error

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector, short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write, open_regular_file
 from eschorty_ros.core.base.schema import Schema, Within, validate
-from eschorty_ros.core.base.yaml_file import read_yaml
+from eschorty_ros.core.base.yaml_file import read_yaml, write_yaml
 from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, load_calibration
@@ -300,15 +299,8 @@ def write_laser_yaml(path: str | os.PathLike[str], modulation: Modulation) -> No
     """
     if not isinstance(modulation, Modulation):
         raise ArgumentError(f"modulation is {short(modulation)}; give a Modulation")
-    data: dict[str, Any] = {
-        "frequency_hz": float(modulation.frequency_hz),
-        "duty": float(modulation.duty),
-        "waveform": modulation.waveform,
-    }
-    if modulation.on_edge_us is not None:
-        data["on_edge_us"] = int(modulation.on_edge_us)
-    with atomic_write(path) as stream:
-        stream.write(yaml.safe_dump(data, sort_keys=False).encode())
+    known = {name: value for name, value in asdict(modulation).items() if value is not None}
+    write_yaml(path, known)
 
 
 def write_stage_csv(path: str | os.PathLike[str], t_us: ArrayLike, position_mm: ArrayLike) -> None:

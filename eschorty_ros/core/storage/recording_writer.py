@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.files import GrowingFile, atomic_write
+from eschorty_ros.core.base.files import GrowingFile
+from eschorty_ros.core.base.yaml_file import write_yaml
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, save_calibration
 from eschorty_ros.core.storage.cloud import Points, write_cloud
@@ -68,9 +68,8 @@ class RecordingWriter:
             save_calibration(calibration, self.path / CALIBRATION_FILE)
             write_laser_yaml(self.path / LASER_FILE, modulation)
             if scan is not None:
-                write_scan_yaml(self.path / SCAN_FILE, scan)
-                with atomic_write(self.path / SETTINGS_FILE) as stream:
-                    stream.write(yaml.safe_dump(dict(settings or {}), sort_keys=False).encode())
+                write_yaml(self.path / SCAN_FILE, scan.as_dict())
+                write_yaml(self.path / SETTINGS_FILE, settings or {})
             events = self.path / EVENTS_FILE
             raw = RawWriter(events, width=calibration.columns, height=calibration.rows)
             self._raw = self._files.enter_context(raw)
@@ -109,7 +108,7 @@ class RecordingWriter:
 
     def end(self, scan: ScanLog, points: Points | None = None) -> None:
         """Write what is known at the end of a scan: its log and its cloud."""
-        write_scan_yaml(self.path / SCAN_FILE, scan)
+        write_yaml(self.path / SCAN_FILE, scan.as_dict())
         if points is not None and len(points):
             write_cloud(self.path / SCAN_CLOUD_FILE, points)
 
@@ -140,9 +139,3 @@ def make_recording_folder(folder: Path) -> None:
         ) from error
     if filled:
         raise ArgumentError(f"cannot record into {folder}: it is not empty; choose another folder")
-
-
-def write_scan_yaml(path: str | os.PathLike[str], scan: ScanLog) -> None:
-    """Write ``scan.yaml`` at ``path``."""
-    with atomic_write(path) as stream:
-        stream.write(yaml.safe_dump(scan.as_dict(), sort_keys=False).encode())
