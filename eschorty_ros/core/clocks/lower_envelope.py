@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
-from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, T_US_LIMIT, ClockLine
+from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 
 _BINS = 600
 # Points further above the line are late because of the host and do not count.
@@ -55,8 +55,6 @@ class LowerEnvelope:
 
     def observe(self, t_us: int, arrival_ns: int) -> ClockLine:
         """Add the arrival of the event of sensor time ``t_us``; times must not go back."""
-        t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
-        arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         points = self._points
         bin_ = t_us // self._bin_us
         if not points or points[-1][0] != bin_:
