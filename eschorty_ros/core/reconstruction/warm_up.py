@@ -31,12 +31,8 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
         np.arange(periods) * 1000 + 100, np.arange(columns), np.arange(events), indexing="ij"
     )
     row = calibration.rows // 2 + event
-    data = Encoder(calibration.columns, calibration.rows).encode(
-        t.ravel().astype(np.int64),
-        column.ravel().astype(np.uint16),
-        row.ravel().astype(np.uint16),
-        np.ones(t.size, np.uint8),
-    )
+    encoder = Encoder(calibration.columns, calibration.rows)
+    data = encoder.encode(t.ravel(), column.ravel(), row.ravel(), np.ones(t.size, np.uint8))
     settings = replace(settings or Settings(), periods_per_profile=1)
     reconstructor = Reconstructor(calibration, modulation, settings)
     # With the first piece the phase is known, and the second is decoded straight into columns.
