@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
 from eschorty_ros.surfaces.grid import CloudGrid
 
 POINTS_MIN = 30
 _EXTENT_MIN_MM = 0.01
 COMMON_SHARE = 0.16
 """Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
-MAD = 1.4826
-"""Standard deviation of Gaussian errors over their median absolute deviation."""
 CUT_SIGMA = 4.0
 _SURE_SIGMAS = 3.0
 _ITERATIONS = 20
@@ -148,7 +147,7 @@ def solve(design: Array, part: Part) -> Fit:
         )[0]
         residual = part.xyz[:, 0] - design @ values
         ratio = residual / part.sigma
-        scale = max(MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
+        scale = max(SIGMA_PER_MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
         before, kept = kept, np.abs(ratio) <= CUT_SIGMA * scale
         if np.array_equal(kept, before):
             break
@@ -249,7 +248,7 @@ def _alike(ratio: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     for cell in np.unique(cells):
         at = np.flatnonzero(cells == cell)
         off = np.abs(ratio[at] - np.median(ratio[at]))
-        alike[at] = off <= CUT_SIGMA * max(MAD * float(np.median(off)), 1.0)
+        alike[at] = off <= CUT_SIGMA * max(SIGMA_PER_MAD * float(np.median(off)), 1.0)
     return alike
 
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array, positive
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import organise
-from eschorty_ros.surfaces.plane import COMMON_SHARE, CUT_SIGMA, MAD, Part, clustered_covariance
+from eschorty_ros.surfaces.plane import COMMON_SHARE, CUT_SIGMA, Part, clustered_covariance
 from eschorty_ros.surfaces.profiles import period_s
 
 if TYPE_CHECKING:
@@ -247,9 +248,9 @@ def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float
             "overlap, a start nearer to it, or a wider reach"
         )
     # The normals of one place in both clouds differ by their noise; half of it is in their mean.
-    noise = MAD * float(np.median(difference[near])) / 2.0
+    noise = SIGMA_PER_MAD * float(np.median(difference[near])) / 2.0
     ratio = np.abs(residual) / sigma
-    near &= ratio <= CUT_SIGMA * max(MAD * float(np.median(ratio[near])), 1.0)
+    near &= ratio <= CUT_SIGMA * max(SIGMA_PER_MAD * float(np.median(ratio[near])), 1.0)
     ours, moved, normals, residual, sigma = (
         v[near] for v in (ours, moved, normals, residual, sigma)
     )

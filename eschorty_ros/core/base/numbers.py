@@ -15,6 +15,9 @@ SMALLEST = 2.3e-308
 TIME_LIMIT = 1 << 62
 """Times, us or ns, stay within this, so that sums and differences of two fit 64 bits."""
 
+SIGMA_PER_MAD = 1.4826
+"""Standard deviation of Gaussian errors over their median absolute deviation."""
+
 
 def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
     """Return ``value`` as a finite float from ``low`` to ``high``."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
 from eschorty_ros.core.calibration.fit import refuse_singular, search
 from eschorty_ros.core.calibration.residuals import (
     Observed,
@@ -27,8 +28,6 @@ _CUT_SIGMA = 4.0
 _SCALE_MAX = 10.0
 # 95 % efficiency on Gaussian errors.
 _CAUCHY = 2.385
-# Median absolute deviation to standard deviation of Gaussian errors.
-_MAD = 1.4826
 _ITERATIONS = 15
 _SCALE_CONVERGED = 1e-3
 _PAIRED_MAX = 40
@@ -118,7 +117,7 @@ def _cut(
 
 def _scale(distance: Array, known: Mask) -> float:
     """Return how much larger the better half's residuals are than stated; at least 1."""
-    return max(1.0, _MAD * float(np.median(np.abs(distance[known]))))
+    return max(1.0, SIGMA_PER_MAD * float(np.median(np.abs(distance[known]))))
 
 
 def _check(distance: Array, known: Mask) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.pulses import PulseTrain
 from eschorty_ros.core.clocks.stage_track import StageTrack
@@ -184,7 +185,7 @@ class _Match:
             )
             late_ns += by_ns
             slope += by_slope
-            noise_mm = max(1.4826 * float(np.median(np.abs(offset_mm[near]))), _NOISE_MM)
+            noise_mm = max(SIGMA_PER_MAD * float(np.median(np.abs(offset_mm[near]))), _NOISE_MM)
             limit_mm = min(4.0 * noise_mm, 0.25 * self._pulses.interval_mm)
         drift_ppb = self._arrivals.drift_ppb - round(slope * 1e9)
         known = ~np.isnan(offset_mm)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.reconstruction.profiles import add_stage, stage_offset_m
 
@@ -28,7 +29,6 @@ _CELLS_MIN = 16
 _BANDS_MIN = 4
 # Cells further off than so many deviations show something that moved between the passes.
 _DEVIATIONS_MAX = 4.0
-_DEVIATION_PER_MEDIAN = 1.4826
 _ROUNDS = 3
 # A lag of less than so many standard deviations is none.
 _SURE = 3.0
@@ -178,7 +178,7 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
         squares = np.where(known, square * faster * faster, 0.0).sum(axis=0)
         left_us = products.sum() / squares.sum()
         error_mm = np.abs(apart_mm - left_us * slope * faster)
-        deviation_mm = _DEVIATION_PER_MEDIAN * np.median(error_mm[known])
+        deviation_mm = SIGMA_PER_MAD * np.median(error_mm[known])
         known &= error_mm <= _DEVIATIONS_MAX * deviation_mm
     bands = np.array_split(np.arange(shape[1]), _BANDS)
     enough = [band for band in bands if known[:, band].sum() >= _CELLS_MIN]
