@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,24 +67,15 @@ class Findings:
     """Residuals of the targets in a fit of k' and b'; empty below two targets."""
 
 
-class Capture(Protocol):
-    """Events and profiles of a calibration; one thread fills it, others search copies."""
+class Capture(ABC):
+    """Events and profiles of a calibration; one thread fills it, others search copies.
 
-    frame: AggregateFrame
-    packets_lost: int
+    Its decoder may start anywhere in the stream.
 
-    def packet(self, packet: Packet) -> None:
-        """Add the next bytes of the EVT3 stream."""
-
-    def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
-        """Add profiles whose stage positions are known."""
-
-    def find(self, frame: AggregateFrame) -> Findings:
-        """Search the targets in a copy of the frame."""
-
-
-class _Frame:
-    """The sum of all events, with a decoder of its own that may start anywhere in the stream."""
+    Public attributes:
+    - ``frame``: The sum of all events.
+    - ``packets_lost``: Packets missing by their ``seq``.
+    """
 
     def __init__(self, nominal: Calibration) -> None:
         self._nominal = nominal
@@ -102,8 +93,16 @@ class _Frame:
         self._next_seq = packet.seq + 1
         self.frame.add(self._decoder.decode(packet.data))
 
+    @abstractmethod
+    def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
+        """Add profiles whose stage positions are known."""
 
-class PostsCapture(_Frame):
+    @abstractmethod
+    def find(self, frame: AggregateFrame) -> Findings:
+        """Search the targets in a copy of the frame."""
+
+
+class PostsCapture(Capture):
     """A capture of targets at rest, side by side.
 
     - ``nominal``: The build as designed.
@@ -126,7 +125,7 @@ class PostsCapture(_Frame):
         )
 
 
-class SweepCapture(_Frame):
+class SweepCapture(Capture):
     """A capture of one target that the stage moves along the range.
 
     - ``request``: With a sweep.
@@ -179,9 +178,7 @@ def enough_targets(findings: Findings, expected: int) -> Targets:
     )
 
 
-def make_capture(
-    request: CaptureRequest, nominal: Calibration, line_width_px: float
-) -> PostsCapture | SweepCapture:
+def make_capture(request: CaptureRequest, nominal: Calibration, line_width_px: float) -> Capture:
     """Make the capture of a request."""
     if request.sweep is not None:
         return SweepCapture(request, nominal)
