@@ -27,10 +27,10 @@ class EventFrame:
 
     def render(self) -> NDArray[np.uint8]:
         """Return the image at the newest sensor time, (rows, columns) uint8."""
+        image = np.zeros(self._newest_us.shape, dtype=np.uint8)
         now_us = self._decoder.time_us
         if now_us is None:
-            return np.zeros(self._newest_us.shape, dtype=np.uint8)
-        image = np.zeros(self._newest_us.shape, dtype=np.uint8)
+            return image
         recent = now_us - self._newest_us < 8 * _TAU_US
         age_us = (now_us - self._newest_us[recent]).astype(np.float64)
         image[recent] = np.rint(255.0 * np.exp(-np.maximum(age_us, 0.0) / _TAU_US))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import MARK_DTYPE
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 
 _PIECE_BYTES = 16_384
@@ -27,13 +26,11 @@ class TimedPacket:
     data: bytes
     from_us: int
     until_us: int
-    packets_lost: int = 0
-    laser_on: bool = False
+    packets_lost: int
+    laser_on: bool
 
 
-def timed_packets(
-    reader: RawReader, marks: NDArray[np.void] | None = None
-) -> Iterator[TimedPacket]:
+def timed_packets(reader: RawReader, marks: NDArray[np.void]) -> Iterator[TimedPacket]:
     """Yield the stream in packets of at most 256 kB and about 10 ms; joined they are the file.
 
     A packet begins at each of ``marks`` (MARK_DTYPE, shape (n,)).
@@ -42,9 +39,13 @@ def timed_packets(
     pending: list[bytes] = []
     size, mark = 0, (0, False)
     from_us: int | None = None
-    for piece, marked in _pieces(reader, np.empty(0, MARK_DTYPE) if marks is None else marks):
+
+    def packet() -> TimedPacket:
+        return TimedPacket(b"".join(pending), from_us or 0, decoder.time_us or 0, *mark)
+
+    for piece, marked in _pieces(reader, marks):
         if pending and (marked is not None or size + len(piece) > SIZE_MAX_BYTES):
-            yield TimedPacket(b"".join(pending), from_us or 0, decoder.time_us or 0, *mark)
+            yield packet()
             pending, size, mark, from_us = [], 0, (0, False), decoder.time_us
         mark = marked or mark
         decoder.decode(piece)
@@ -53,10 +54,10 @@ def timed_packets(
         now_us = decoder.time_us or 0
         from_us = now_us if from_us is None else from_us
         if now_us - from_us >= _PACKET_SPAN_US:
-            yield TimedPacket(b"".join(pending), from_us, now_us, *mark)
+            yield packet()
             pending, size, mark, from_us = [], 0, (0, False), now_us
     if pending:
-        yield TimedPacket(b"".join(pending), from_us or 0, decoder.time_us or 0, *mark)
+        yield packet()
 
 
 def _pieces(
