@@ -24,7 +24,7 @@ class SensorEpoch:
     - ``edges_missing``: True after 30 pulses without an edge that fits.
     """
 
-    def __init__(self, clock: SensorClock, pulses: PulseTrain | None = None) -> None:
+    def __init__(self, clock: SensorClock, pulses: PulseTrain | None) -> None:
         self.clock = clock
         self.edges = EdgeClock(pulses)
         self.edges_missing = False

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 class Effort:
     """Size of a run: the same code with more or fewer columns, periods and repeats."""
 
-    fast: bool = False
+    fast: bool
     """A coarse run for tests."""
-    seed: int = 1
+    seed: int
     """Seed of everything random."""
 
     def choose(self, full: int, fast: int) -> int:

@@ -113,7 +113,7 @@ class Flatness(NamedTuple):
         return self.value_mm.value - self.of_plane_mm > _SURE_SIGMAS * self.value_mm.sigma
 
 
-def fit_plane(part: Part, common_mm: float = 0.0) -> Plane:
+def fit_plane(part: Part, common_mm: float) -> Plane:
     """Return the weighted least-squares plane of range over y and z, outliers left out.
 
     ``common_mm`` is the standard deviation of an error that the points share; from one end of the
@@ -191,7 +191,7 @@ def _spread(score: Array, group: NDArray[np.int64]) -> Array:
     return np.asarray(sums @ sums.T * (count / max(count - 2, 1)))
 
 
-def check_part(part: Part, name: str = "a surface") -> None:
+def check_part(part: Part, name: str) -> None:
     """Refuse points that are too few for a plane or on one line with an ArgumentError."""
     lines = len(np.unique(part.line))
     columns = len(np.unique(part.column))

@@ -92,8 +92,8 @@ def test_forward_map_is_finite_or_flagged(range_mm, b_mm):
 def test_limits_at_the_pole_are_infinite_without_complaint():
     m = model("config_3")
     assert float(m.magnification(-m.b_prime_px)) == 0.0
-    assert float(depth_of_field_mm(0.0, 2.0, 85.87, -7.62)) == np.inf
-    assert float(depth_of_field_mm(1e-200, 2.0, 85.87, -7.62)) == np.inf
+    assert float(depth_of_field_mm(0.0, 2.0, 85.87, -7.62, 4.86)) == np.inf
+    assert float(depth_of_field_mm(1e-200, 2.0, 85.87, -7.62, 4.86)) == np.inf
     assert float(m.range_per_row_mm(np.inf)) == np.inf
     assert float(m.range_per_row_mm(1e200)) == np.inf
     assert float(m.row(np.inf)) == -m.b_prime_px

@@ -26,7 +26,7 @@ class EdgeClock:
       from a stage.
     """
 
-    def __init__(self, pulses: PulseTrain | None = None) -> None:
+    def __init__(self, pulses: PulseTrain | None) -> None:
         self.fit: EdgeFit | None = None
         self.pulses = pulses
         self.edges_dropped = 0

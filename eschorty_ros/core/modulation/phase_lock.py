@@ -46,7 +46,7 @@ class PhaseLock:
     - ``missing``: True when the stream ended without a phase.
     """
 
-    def __init__(self, modulation: Modulation, every: int = 1) -> None:
+    def __init__(self, modulation: Modulation, every: int) -> None:
         self.schedule = EdgeSchedule(modulation, every)
         self.missing = False
         self._modulation = modulation

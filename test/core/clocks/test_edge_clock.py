@@ -32,7 +32,7 @@ def test_edges_count_once_the_odometry_covers_them():
 
 def test_no_fit_without_pulses():
     bench = StagePulses()
-    clock = EdgeClock()
+    clock = EdgeClock(None)
     clock.add(bench.edges, np.ones(bench.edges.size, np.uint8))
     assert not clock.update(bench.track, bench.arrivals(1.0), now=True)
     clock.pulses = PULSES
