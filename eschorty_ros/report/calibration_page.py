@@ -21,7 +21,7 @@ from eschorty_ros.core.calibration import (
 from eschorty_ros.report import calibration_figures as drawn
 from eschorty_ros.report.figures import DPI
 from eschorty_ros.report.page import number, render
-from eschorty_ros.report.sections import Picture, describe
+from eschorty_ros.report.sections import Picture, picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -126,9 +126,7 @@ def _picture(figure: Figure, caption: str) -> Picture:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=DPI)
     data = base64.b64encode(stream.getvalue()).decode()
-    width, height = (round(inches * DPI) for inches in figure.get_size_inches())
-    file = f"data:image/png;base64,{data}"
-    return Picture(file, caption, describe(figure) or caption, width, height)
+    return picture(f"data:image/png;base64,{data}", figure, caption)
 
 
 def _targets(report: CalibrationReport) -> list[list[float | str]]:
@@ -164,4 +162,4 @@ def _sigmas(report: CalibrationReport) -> list[list[float]]:
         report.range_sigma_mm(rows),
         report.range_sigma_mm(rows, SIGMA_ROW_PX),
     )
-    return [[float(column[i]) for column in columns] for i in range(ROWS_SHOWN)]
+    return np.column_stack(columns).tolist()

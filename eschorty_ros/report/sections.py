@@ -120,6 +120,12 @@ def run_sections(
         )
 
 
+def picture(file: str, figure: Figure, caption: str) -> Picture:
+    """Return a figure as written to a file."""
+    width, height = (round(inches * figures.DPI) for inches in figure.get_size_inches())
+    return Picture(file, caption, describe(figure) or caption, width, height)
+
+
 def describe(figure: Figure) -> str:
     """Return title, axes and named lines of every part of a figure in words."""
     parts = []
@@ -158,9 +164,7 @@ def _write(name: str, outcome: Outcome, folder: Path) -> tuple[list[Picture], li
     for stem, figure in outcome.figures.items():
         file = f"{name}-{stem}.png"
         figures.save(figure, folder / file)
-        width, height = (round(inches * figures.DPI) for inches in figure.get_size_inches())
-        caption = outcome.captions.get(stem, stem)
-        pictures.append(Picture(file, caption, describe(figure) or caption, width, height))
+        pictures.append(picture(file, figure, outcome.captions.get(stem, stem)))
     sheets = []
     for stem, table in outcome.tables.items():
         file = f"{name}-{stem}.csv"
