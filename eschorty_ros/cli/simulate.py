@@ -79,7 +79,7 @@ def command(
             seed=seed,
             parameters=preset(pixels),
             effects=Effects.parse(effects),
-            progress=lambda done, total: report(done / max(total, 1), ""),
+            progress=report,
         )
     truth = recording.truth
     pairs(

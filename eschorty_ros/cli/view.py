@@ -150,7 +150,7 @@ def _draw_growing(points: Points, own: bool, target: Path) -> None:
     if not own:
         raise FormatError(f"{target} needs times and columns; give a cloud of this package")
     with progress_bar("drawing") as report:
-        write_growing_scan(points, target, lambda done, total: report(done / total, ""))
+        write_growing_scan(points, target, report)
 
 
 def _read_other(cloud: Path) -> Points:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.figures import central, grid_of, image_of
 
@@ -37,15 +37,12 @@ class _Surface(NamedTuple):
 
 
 def write_growing_scan(
-    points: NDArray[np.void],
-    path: str | os.PathLike[str],
-    progress: Callable[[int, int], Any] | None = None,
+    points: NDArray[np.void], path: str | os.PathLike[str], progress: Progress
 ) -> None:
     """Write a GIF of the cloud: profile by profile as the stage moves, then from both sides.
 
     - ``points``: POINT_DTYPE, shape (n,).
     - ``path``: Ends in ``.gif``.
-    - ``progress``: Called with frames drawn so far and frames in all.
 
     Raises ``ArgumentError`` when the cloud has less than two profiles or columns, or the path
     cannot be written.
@@ -63,8 +60,7 @@ def write_growing_scan(
     images = []
     for view in views:
         images.append(Image.fromarray(_frame(surface, *view)))
-        if progress is not None:
-            progress(len(images), len(views))
+        progress(len(images) / len(views), "")
     # One palette for all frames: that of a frame with every colour.
     palette = images[GROWING_FRAMES * 3 // 4].quantize(COLOURS)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import atomic_files
+from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.clocks import MotionPlan, plan_move
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, save_calibration
@@ -55,7 +56,7 @@ def simulate_recording(
     background_hz: float = BACKGROUND_HZ,
     parameters: PixelParameters | None = None,
     effects: Effects | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Recording:
     """Scan ``scene`` from ``start_mm`` to ``stop_mm`` and write the recording folder.
 
@@ -69,7 +70,7 @@ def simulate_recording(
       run either way.
     - ``seed``: Same seed, same bytes.
     - ``background_hz``: Background events per pixel and second.
-    - ``progress``: Called with the microseconds done and in total.
+    - ``progress``: See `Progress`.
 
     Raises ``ArgumentError`` for a value outside its range or a folder that cannot be written.
     """
@@ -91,7 +92,7 @@ def simulate_recording(
             while world.now_us < end_us:
                 raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
                 if progress is not None:
-                    progress(world.now_us, end_us)
+                    progress(world.now_us / end_us, "")
         # One sample past the end: the last events must be between two samples.
         t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
         write_stage_csv(made / STAGE_FILE, t_us, move.state(t_us * 1000)[0])

@@ -321,15 +321,15 @@ def test_timelines_replace_the_future_and_forget_the_past() -> None:
 
 
 def test_recording_holds_everything(tmp_path) -> None:
-    calls: list[tuple[int, int]] = []
+    shares: list[float] = []
     options = {"start_mm": 30, "stop_mm": 20.0, "speed_mm_s": 100.0, "seed": 5}
     scene = Steps(stage_band_mm=3.0)
     made = simulate_recording(
-        tmp_path / "a", scene, SMALL, progress=lambda *call: calls.append(call), **options
+        tmp_path / "a", scene, SMALL, progress=lambda share, _: shares.append(share), **options
     )
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert names == ["calibration.yaml", "events.raw", "laser.yaml", "stage.csv", "truth.csv"]
-    assert calls[-1][0] == calls[-1][1]
+    assert shares[-1] == 1.0
     recording = load_recording(tmp_path / "a")
     assert recording.modulation == made.modulation == Modulation(70.0, 0.5, "square", 50_000)
     assert recording.calibration == SMALL
