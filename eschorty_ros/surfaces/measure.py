@@ -85,25 +85,23 @@ def parse_region(text: str) -> Region:
     >>> parse_region("100:400,:60")
     Region(columns=(100.0, 400.0), sweep_mm=(-inf, 60.0))
     """
-    spans: list[tuple[float, float]] = []
-    for span in text.split(","):
-        ends = span.split(":")
-        try:
-            low, high = (
-                float(end) if end.strip() else default
-                for end, default in zip(ends, (-math.inf, math.inf), strict=True)
-            )
-        except ValueError:
-            low, high = 1.0, 0.0
-        if not low <= high:
-            spans = []
-            break
-        spans.append((low, high))
-    if len(spans) != 2:
+    try:
+        columns, sweep = text.split(",")
+        return Region(_span(columns), _span(sweep))
+    except ValueError:
         raise ArgumentError(
             f"region {text!r} is not COLUMNS,SWEEP in px and mm; write it as 100:400,20:60"
-        )
-    return Region(*spans)
+        ) from None
+
+
+def _span(text: str) -> tuple[float, float]:
+    """Return both ends of a text such as ``20:60``; raise ``ValueError`` for any other."""
+    first, last = text.split(":")
+    low = float(first) if first.strip() else -math.inf
+    high = float(last) if last.strip() else math.inf
+    if not low <= high:
+        raise ValueError(text)
+    return low, high
 
 
 def measure(
