@@ -76,12 +76,9 @@ def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArr
         return t_us
     gap = np.diff(t_us)
     high, low = gap[rising[:-1] & ~rising[1:]], gap[~rising[:-1] & rising[1:]]
-    if min(high.size, low.size) < 3:
-        short = np.median(high) <= np.median(low) if high.size and low.size else True
-        return t_us[rising] if short else t_us[~rising]
-    spread = [float(np.subtract(*np.quantile(gaps, (0.8, 0.2)))) + 1.0 for gaps in (high, low)]
-    if max(spread) < 1.5 * min(spread):
-        begins_rising = np.median(high) <= np.median(low)
-    else:
-        begins_rising = spread[0] < spread[1]
+    begins_rising = not (high.size and low.size) or np.median(high) <= np.median(low)
+    if min(high.size, low.size) >= 3:
+        spread = [float(np.subtract(*np.quantile(gaps, (0.8, 0.2)))) + 1.0 for gaps in (high, low)]
+        if max(spread) >= 1.5 * min(spread):
+            begins_rising = spread[0] < spread[1]
     return t_us[rising] if begins_rising else t_us[~rising]
