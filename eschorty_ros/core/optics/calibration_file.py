@@ -107,11 +107,8 @@ class Calibration(Schema):
             column, row, columns, rows = self.roi_px
             fits = 0 <= column < column + columns <= self.columns
             if not (fits and 0 <= row < row + rows <= self.rows):
-                sensor = f"{self.columns} x {self.rows}"
-                yield (
-                    "roi_px",
-                    (f"write first column, first row, columns, rows within the sensor of {sensor}"),
-                )
+                remedy = "write first column, first row, columns, rows within the sensor of"
+                yield "roi_px", f"{remedy} {self.columns} x {self.rows}"
         model = self.model()
         near_mm, far_mm = model.range_limits_mm
         if not model.tilt_sine < 1.0:

@@ -286,7 +286,6 @@ def _sensor_tilt_deg(
                 "without the ends"
             )
         return tilt_deg
-    assert baseline_mm is not None
     sheet = 1.0 / math.tan(math.radians(theta_deg))
     cotangent = number("baseline_mm", baseline_mm) / focal_length_mm - sheet
     if not 0.0 < cotangent < math.inf:
@@ -298,6 +297,7 @@ def _sensor_tilt_deg(
 
 
 def _depth(name: str, range_mm: float | None, b_mm: float) -> float:
-    if not 1e-6 < number(name, range_mm) + number("b_mm", b_mm) < math.inf:
+    depth = number(name, range_mm) + number("b_mm", b_mm)
+    if not 1e-6 < depth < math.inf:
         raise ArgumentError(f"{name} is {range_mm!r}; choose a range beyond -b_mm = {-b_mm:g} mm")
-    return float(range_mm or 0.0) + b_mm
+    return depth
