@@ -131,16 +131,16 @@ def reconstruct_recording(
         *recording_warnings(recording, used, counters, points, span_us, shown),
     )
     return Result(
-        points,
-        profiles,
-        counters,
-        cloud.profile_count,
-        reconstructor.periods_per_profile,
-        counters["events"],
-        time.perf_counter() - began,
-        warnings,
-        organized,
-        lag,
+        points=points,
+        profiles=profiles,
+        counters=counters,
+        profile_count=cloud.profile_count,
+        periods_per_profile=reconstructor.periods_per_profile,
+        events=counters["events"],
+        seconds=time.perf_counter() - began,
+        warnings=warnings,
+        organized=organized,
+        pass_lag=lag,
     )
 
 
