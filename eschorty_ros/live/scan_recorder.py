@@ -134,7 +134,7 @@ class ScanRecorder:
     def end(self, points: Points | None, reason: str = "") -> None:
         """Queue the end: the stage by the clock as it is known now, the log, the cloud.
 
-        ``reason`` says why the recording is not that of the entire scan.
+        ``reason`` is why the recording is not that of the entire scan.
         """
         samples = self._samples(0)
         self._queue(lambda: self._write_end(samples, points, reason))

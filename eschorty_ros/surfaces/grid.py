@@ -49,8 +49,8 @@ class Links(NamedTuple):
 def organise(points: NDArray[np.void]) -> CloudGrid:
     """Return a cloud as a grid.
 
-    Left out are points without finite place, time or positive sigma, and those whose flags say that
-    they are on two surfaces or cut by the sensor's edge.
+    Left out are points without finite place, time or positive sigma, and those flagged as on two
+    surfaces or cut by the sensor's edge.
 
     - ``points``: POINT_DTYPE, shape (n,).
 

@@ -304,7 +304,7 @@ def open_when_served(host: str, port: int) -> None:
 
 
 def _check_free(host: str, port: int) -> None:
-    """Refuse a port that is taken; viser would take another one without a word."""
+    """Refuse a port that is taken; viser would take another one and not report it."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

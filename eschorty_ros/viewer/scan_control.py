@@ -56,7 +56,7 @@ class Conditions:
 class ScanControl:
     """Decides over requests of a page; light needs the switch and the code of the terminal.
 
-    Whatever else reaches the server does not know the code.
+    Other programs that reach the server do not have the code.
 
     - ``allowed``: Whether scans may be started at all.
     - ``clock``: Returns monotonic seconds.

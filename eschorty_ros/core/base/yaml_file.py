@@ -48,7 +48,7 @@ class Document:
 def read_yaml(
     path: str | os.PathLike[str], error: type[EschortyError], follow_links: bool = True
 ) -> Document:
-    """Parse a YAML file.
+    """Return the content of a YAML file.
 
     Raises ``error`` when the file cannot be read, is too large or is not plain YAML.
     """
@@ -57,7 +57,7 @@ def read_yaml(
 
 
 def parse_yaml(data: bytes, path: str | os.PathLike[str], error: type[EschortyError]) -> Document:
-    """Parse the bytes of a YAML file; ``path`` is for messages."""
+    """Return the content of a YAML file from its bytes; ``path`` is for messages."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as cause:

@@ -123,7 +123,7 @@ def calibrate(
     robust: bool | None = None,
     date: str | None = None,
 ) -> CalibrationReport:
-    """Fit a build to targets and diagnose the result.
+    """Return a build fitted to targets, with diagnostics of the fit.
 
     - ``targets``: At two different ranges or more.
     - ``nominal``: The design: fixed parameters, centres of the priors, geometry.

@@ -91,7 +91,7 @@ def _cut(
     priors: Mapping[str, float],
     values: Values,
 ) -> tuple[Mask, Array]:
-    """Refit the targets within the cut until they are the same ones."""
+    """Refit the targets within the cut until they are the same ones; return as `inliers`."""
     every = Problem(observed, design, names, priors, values)
     distance = every.whitened(values)
     kept = np.zeros(len(observed), dtype=bool)

@@ -54,7 +54,7 @@ class LowerEnvelope:
         return len(self._points)
 
     def observe(self, t_us: int, arrival_ns: int) -> ClockLine:
-        """Add the arrival of the event of sensor time ``t_us``; times must not go back."""
+        """Add the arrival of an event of sensor time ``t_us``, which never falls; return `line`."""
         points = self._points
         bin_ = t_us // self._bin_us
         if not points or points[-1][0] != bin_:

@@ -49,7 +49,7 @@ class Timing:
 def start_of(
     earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array, usual: Delays
 ) -> Timing:
-    """Estimate the start from the bounds of each reading.
+    """Return the start, estimated from the bounds of each reading.
 
     Delays are positive: the true start is after all ``earliest`` and before all ``latest``. The
     extremes are off by the mean delay over the number of readings, as for exponential delays; the

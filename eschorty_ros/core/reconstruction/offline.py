@@ -269,7 +269,7 @@ def _push(
     begin: int,
     marks: NDArray[np.void],
 ) -> None:
-    """Push a chunk that begins at a byte of the stream, with what the marks in it say."""
+    """Push a chunk that begins at a byte of the stream, with the marks in it."""
     first, last = np.searchsorted(marks["byte"], (begin, begin + len(chunk)))
     at = 0
     for byte, lost, laser_on in marks[first:last].tolist():

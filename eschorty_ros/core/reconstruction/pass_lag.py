@@ -1,6 +1,6 @@
 """How late the points of a scan forth and back are, from the two passes.
 
-Pixels remember where a line was, so that a row shows the surface of a moment ago. A pass forth and
+Pixels respond late to a line that moves, so that a row shows an earlier surface. A pass forth and
 one back are late in opposite directions along the stage: where they overlap, ranges differ by the
 slope of the surface times the travel in the lag, twice. An offset between the clocks of camera and
 stage does the same. In a single pass a lag moves the cloud as a whole, which nothing shows.

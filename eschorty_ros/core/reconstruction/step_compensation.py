@@ -62,7 +62,7 @@ class _History(NamedTuple):
 class _Points(NamedTuple):
     """Points of one profile: how many profiles before and after it a step is off the line.
 
-    ``shift_px`` is what the widths say, 0 without a step, and ``difference_px`` what the rows do.
+    ``shift_px`` is by the widths, 0 without a step, and ``difference_px`` by the rows.
     """
 
     column: NDArray[np.uint16]
