@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """Counts of a decoder since it was made or reset."""
+    """Counts of a decoder since it was made."""
 
     events: int = 0
     """Returned, as are ``triggers``."""

@@ -61,17 +61,12 @@ class Decoder:
         self._counts = record(*COUNTS, numbers=self._numbers[len(_STATE) :])
         state = self._state, self._counts, self._numbers
         self._use(DecoderMemory(self.width, self.height, *state, _trigger_arrays(0)))
-        self.reset()
+        self._odd = b""
+        self._drop_context()
 
     def _use(self, memory: DecoderMemory) -> None:
         self._memory: DecoderMemory = memory
         self._boxed: Boxed | None = None
-
-    def reset(self) -> None:
-        """Drop state and counters."""
-        self._numbers[:] = 0
-        self._odd = b""
-        self._drop_context()
 
     def note_gap(self) -> None:
         """Call after lost bytes: keeps the epoch, drops row and vector base.
@@ -95,7 +90,7 @@ class Decoder:
 
     @property
     def counters(self) -> Counters:
-        """Counts since construction or ``reset``."""
+        """Counts since construction."""
         counts = dict(zip(COUNTS, self._counts.item(), strict=True))
         counts["odd_byte"] = len(self._odd)
         return Counters(**counts)
