@@ -27,18 +27,18 @@ class SweepCoverage:
 
     def add(self, t_ns: int, position_mm: float) -> None:
         """Add a stage sample at ROS time ``t_ns``."""
-        before, self._last = self._last, (t_ns, position_mm)
-        if before is None or t_ns <= before[0]:
+        before_ns, before_mm = self._last or (t_ns, position_mm)
+        self._last = t_ns, position_mm
+        step_s = (t_ns - before_ns) * 1e-9
+        if step_s <= 0.0:
             return
-        if position_mm == before[1]:
-            self._inside_s += (
-                (t_ns - before[0]) * 1e-9 * (self._low_mm <= position_mm <= self._high_mm)
-            )
+        if position_mm == before_mm:
+            self._inside_s += step_s * (self._low_mm <= position_mm <= self._high_mm)
             return
-        ends_mm = np.clip((before[1], position_mm), self._low_mm, self._high_mm)
+        ends_mm = np.clip((before_mm, position_mm), self._low_mm, self._high_mm)
         inside_mm = abs(float(ends_mm[1] - ends_mm[0]))
         if inside_mm > 0.0:
-            inside_s = (t_ns - before[0]) * 1e-9 * inside_mm / abs(position_mm - before[1])
+            inside_s = step_s * inside_mm / abs(position_mm - before_mm)
             self._inside_s += inside_s
             self._steps.append((inside_s, inside_mm))
 
