@@ -158,15 +158,16 @@ class Page:
                 self._frame.image = np.repeat(small[:, :, None], 3, axis=2)
 
     def _show(self, text: Callable[[int, int], str]) -> None:
-        state = self._cloud.changes, str(self._colour.value), float(self._size.value)
+        colour, size_mm = str(self._colour.value), float(self._size.value)
+        state = self._cloud.changes, colour, size_mm
         if state != self._drawn:
             self._drawn = state
             shown = self._cloud.shown()
-            self._limits = self._draw(shown.xyz, shown.values[state[1]], state[2])
+            self._limits = self._draw(shown.xyz, shown.values[colour], size_mm)
             self._counts = shown.received, shown.stride
         low, high = self._limits
-        unit = " m" if self._colour.value in ("range", "sigma") else ""
-        scale = f"\n\n{self._colour.value}: {low:.4g} to {high:.4g}{unit}" if high > low else ""
+        unit = " m" if colour in ("range", "sigma") else ""
+        scale = f"\n\n{colour}: {low:.4g} to {high:.4g}{unit}" if high > low else ""
         self._text.content = text(*self._counts) + scale
 
     def _draw(
