@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import GrowingFile
 from eschorty_ros.core.base.yaml_file import write_yaml
@@ -41,13 +39,10 @@ SCAN_CLOUD_FILE = "scan.pcd"
 
 
 class RecordingWriter:
-    """Writes the files of a recording; each call either writes all of its data or nothing.
+    """Writes the recording of a scan; each call either writes all of its data or nothing.
 
     - ``folder``: Made here; it must not exist, or be empty.
-    - ``settings``: Settings of the reconstruction, written with ``scan``.
-
-    Public attributes:
-    - ``event_bytes``: Bytes of the stream in ``events.raw``.
+    - ``settings``: Settings of the reconstruction.
 
     Raises ``ArgumentError`` or ``FormatError`` when the folder holds files already or cannot be
     written.
@@ -55,36 +50,28 @@ class RecordingWriter:
 
     def __init__(
         self,
-        folder: str | os.PathLike[str],
+        folder: Path,
         calibration: Calibration,
         modulation: Modulation,
-        scan: ScanLog | None = None,
-        settings: Mapping[str, Any] | None = None,
+        scan: ScanLog,
+        settings: Mapping[str, Any],
     ) -> None:
-        self.path = file_path("folder", folder)
-        make_recording_folder(self.path)
+        self._path = folder
+        make_recording_folder(folder)
         self._files = contextlib.ExitStack()
         try:
-            save_calibration(calibration, self.path / CALIBRATION_FILE)
-            write_laser_yaml(self.path / LASER_FILE, modulation)
-            if scan is not None:
-                write_yaml(self.path / SCAN_FILE, scan.as_dict())
-                write_yaml(self.path / SETTINGS_FILE, settings or {})
-            events = self.path / EVENTS_FILE
-            raw = RawWriter(events, width=calibration.columns, height=calibration.rows)
+            save_calibration(calibration, folder / CALIBRATION_FILE)
+            write_laser_yaml(folder / LASER_FILE, modulation)
+            write_yaml(folder / SCAN_FILE, scan.as_dict())
+            write_yaml(folder / SETTINGS_FILE, settings)
+            raw = RawWriter(folder / EVENTS_FILE, calibration.columns, calibration.rows)
             self._raw = self._files.enter_context(raw)
-            self._stage, self._marks = self._table(STAGE_DTYPE, STAGE_FILE), None
-            if scan is not None:
-                self._marks = self._table(MARK_DTYPE, MARKS_FILE)
+            self._stage = self._table(STAGE_DTYPE, STAGE_FILE)
+            self._marks = self._table(MARK_DTYPE, MARKS_FILE)
         except BaseException:
             self._files.close()
             raise
         self._stage_us: int | None = None
-
-    @property
-    def event_bytes(self) -> int:
-        """Bytes of the stream in ``events.raw``."""
-        return self._raw.bytes_written
 
     def events(self, data: Any) -> None:
         """Append bytes of the stream."""
@@ -92,8 +79,7 @@ class RecordingWriter:
 
     def mark(self, packets_lost: int, laser_on: bool) -> None:
         """Note lost packets, or that the laser was switched on, before the next ``events``."""
-        assert self._marks is not None
-        row = np.array([(self.event_bytes, packets_lost, laser_on)], MARK_DTYPE)
+        row = np.array([(self._raw.bytes_written, packets_lost, laser_on)], MARK_DTYPE)
         self._marks.write(csv_lines(row))
 
     def stage(self, t_us: int, position_mm: float) -> None:
@@ -104,26 +90,20 @@ class RecordingWriter:
 
     def replace_stage(self, samples: NDArray[np.void]) -> None:
         """Write two or more stage samples (STAGE_DTYPE) again, by a clock that is known better."""
-        write_stage_csv(self.path / STAGE_FILE, samples["t_us"], samples["position_mm"])
+        write_stage_csv(self._path / STAGE_FILE, samples["t_us"], samples["position_mm"])
 
-    def end(self, scan: ScanLog, points: Points | None = None) -> None:
+    def end(self, scan: ScanLog, points: Points | None) -> None:
         """Write what is known at the end of a scan: its log and its cloud."""
-        write_yaml(self.path / SCAN_FILE, scan.as_dict())
+        write_yaml(self._path / SCAN_FILE, scan.as_dict())
         if points is not None and len(points):
-            write_cloud(self.path / SCAN_CLOUD_FILE, points)
+            write_cloud(self._path / SCAN_CLOUD_FILE, points)
 
     def close(self) -> None:
         """Close the files; idempotent."""
         self._files.close()
 
-    def __enter__(self) -> RecordingWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _table(self, dtype: np.dtype[Any], name: str) -> GrowingFile:
-        table = self._files.enter_context(GrowingFile(self.path / name))
+        table = self._files.enter_context(GrowingFile(self._path / name))
         table.write(csv_header(dtype))
         return table
 
