@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numba import int64, types, uint16, uint32
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, integer
 from eschorty_ros.core.base.kernel import entry_kernel
+from eschorty_ros.core.evt3 import Events
 from eschorty_ros.core.optics import PIXELS_MAX
 
 _COUNT_MAX = (1 << 32) - 1
 _U2 = types.Array(uint16, 1, "C", readonly=True)
-
-
-class Pixels(Protocol):
-    """Events with columns ``x`` and rows ``y``, as the decoder returns them."""
-
-    @property
-    def x(self) -> NDArray[np.uint16]:
-        """Columns."""
-
-    @property
-    def y(self) -> NDArray[np.uint16]:
-        """Rows."""
 
 
 class AggregateFrame:
@@ -42,7 +29,7 @@ class AggregateFrame:
         self.counts = np.zeros((rows, columns), np.uint32)
         self.events = 0
 
-    def add(self, events: Pixels) -> None:
+    def add(self, events: Events) -> None:
         """Count ``events``, in any order.
 
         Raises ``ArgumentError`` when columns and rows are not uint16 arrays of one length.
