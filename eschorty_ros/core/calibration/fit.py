@@ -179,17 +179,17 @@ def fit(
     if residual is None or white is None:
         raise FitError("the targets lead to no possible build; check them")
     return CalibrationFit(
-        model,
-        names,
-        spread + np.outer(moved, moved),
-        residual[:, 0],
-        problem.sigma_px[:, 0],
-        values[WIDTH_BIAS],
-        priors,
-        condition,
-        dof,
-        math.fsum(white * white),
-        tuple(verdicts),
+        model=model,
+        free=names,
+        covariance=spread + np.outer(moved, moved),
+        residual_px=residual[:, 0],
+        sigma_px=problem.sigma_px[:, 0],
+        width_bias_px=values[WIDTH_BIAS],
+        prior_sigma=priors,
+        condition_number=condition,
+        dof=dof,
+        chi_square=math.fsum(white * white),
+        verdicts=tuple(verdicts),
     )
 
 

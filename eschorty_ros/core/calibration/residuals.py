@@ -81,14 +81,14 @@ class Observed:
         )
         size_mm = np.stack([0.0 * targets.row, targets.size_mm, targets.spacing_mm], axis=1)
         return cls(
-            targets.range_mm,
-            np.nan_to_num(design.normalised_column(targets.column)),
-            np.where(known, measured, 0.0),
-            np.where(known, sigma, 1.0),
-            known,
-            np.where(known, size_mm, 0.0) / (design.pixel_um * 1e-3),
-            targets.sigma_range_mm,
-            targets.sigma_shared_mm,
+            range_mm=targets.range_mm,
+            column_u=np.nan_to_num(design.normalised_column(targets.column)),
+            measured=np.where(known, measured, 0.0),
+            sigma=np.where(known, sigma, 1.0),
+            known=known,
+            per_pixel=np.where(known, size_mm, 0.0) / (design.pixel_um * 1e-3),
+            sigma_range_mm=targets.sigma_range_mm,
+            sigma_shared_mm=targets.sigma_shared_mm,
         )
 
     def __len__(self) -> int:

@@ -83,14 +83,15 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     # The surface ahead of the edge (+y) is below it on the sensor.
     below = ahead != middle
     dark = np.isnan(patch_row)
+    patch_reflectance = np.column_stack((here_reflectance, there_reflectance))
     return Footprint(
-        row[_CENTRE],
-        reflectance[_CENTRE],
-        split,
-        patch_row,
-        np.where(dark, 0.0, np.column_stack((here_reflectance, there_reflectance))),
-        np.where(below | dark, -np.inf, border),
-        np.where(below & ~dark, border, np.inf),
+        row=row[_CENTRE],
+        reflectance=reflectance[_CENTRE],
+        split=split,
+        patch_row=patch_row,
+        patch_reflectance=np.where(dark, 0.0, patch_reflectance),
+        low_row=np.where(below | dark, -np.inf, border),
+        high_row=np.where(below & ~dark, border, np.inf),
     )
 
 
