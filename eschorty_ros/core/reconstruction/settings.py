@@ -102,13 +102,10 @@ class Settings:
     )
     column_limit: int = _number(4096, 16, 4096, "events", "most events kept per column and profile")
     periods_per_profile: int = _number(
-        0,
-        0,
-        1000,
-        "periods",
+        0, 0, 1000, "periods",
         "modulation periods that make one profile; 0 takes as many as give "
         "a column enough events for a point",
-    )
+    )  # fmt: skip
     column_first: int = _number(0, 0, 2047, "columns", "first column to reconstruct")
     column_last: int = _number(2047, 0, 2047, "columns", "last column to reconstruct")
     range_min: float = _number(0.0, 0.0, 1000.0, "m", "nearest range to reconstruct; 0 is no limit")
@@ -116,12 +113,9 @@ class Settings:
         0.0, 0.0, 1000.0, "m", "furthest range to reconstruct; 0 is no limit"
     )
     smoothing_half_width: int = _number(
-        8,
-        0,
-        20,
-        "columns",
+        8, 0, 20, "columns",
         "most neighbours averaged on either side, fewer where rows show detail; 0 is off",
-    )
+    )  # fmt: skip
     smoothing_gate_px: float = _number(
         2.0, 0.0, 100.0, "px",
         "neighbours further off in rows are not averaged, unless rows scatter as much",
@@ -140,31 +134,22 @@ class Settings:
         "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"
     )
     footprint_sigma_px: float = _number(
-        4.1,
-        0.3,
-        60.0,
-        "px",
+        4.1, 0.3, 60.0, "px",
         "standard deviation of the laser line's intensity over the rows, for reflectance",
-    )
+    )  # fmt: skip
     white_width_px: float = _number(
-        0.0,
-        0.0,
-        200.0,
-        "px",
+        0.0, 0.0, 200.0, "px",
         "width (standard deviation of the rows) of a white target, to which reflectance refers; "
         "0 takes the median of each profile",
-    )
+    )  # fmt: skip
     reflectance_compensation: str = _choice(
         "off", SWITCH, "correct the shift of points at reflectance steps"
     )
     stage_speed_mm_s: float = _number(
-        300.0,
-        -10_000.0,
-        10_000.0,
-        "mm/s",
+        300.0, -10_000.0, 10_000.0, "mm/s",
         "stage speed towards +y, from which the compensation follows a step through the "
         "line, 0 for a resting one; a recording's own speed is used instead",
-    )
+    )  # fmt: skip
     organized: str = _choice(
         "off", SWITCH, "the cloud of a scan as a height map of profiles and columns, NaN where "
         "nothing is",
