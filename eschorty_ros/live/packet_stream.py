@@ -13,13 +13,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.light_warnings import LightWarnings
-from eschorty_ros.live.packet_times import (
-    GAP_NS,
-    Packet,
-    first_time_us,
-    overtaken,
-    skips_time,
-)
+from eschorty_ros.live.packet_times import GAP_NS, Packet, first_time_us, overtaken, skips_time
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 

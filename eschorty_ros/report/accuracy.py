@@ -244,10 +244,7 @@ def _passes(
 
 
 def recorded_truth(
-    points: NDArray[np.void],
-    scene: KnownScene,
-    recording: Recording,
-    sweep: Sweep,
+    points: NDArray[np.void], scene: KnownScene, recording: Recording, sweep: Sweep
 ) -> NDArray[np.void]:
     """Return the scene's ranges at the periods of a recorded scan, by its stage's log.
 

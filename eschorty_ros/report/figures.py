@@ -277,10 +277,7 @@ def draw_map(
 
 
 def _view_3d(
-    axes: Any,
-    points: NDArray[np.void],
-    range_mm: NDArray[np.float64],
-    limits: tuple[float, float],
+    axes: Any, points: NDArray[np.void], range_mm: NDArray[np.float64], limits: tuple[float, float]
 ) -> None:
     shown = np.flatnonzero((range_mm >= limits[0]) & (range_mm <= limits[1]))
     if shown.size > POINTS_IN_3D:

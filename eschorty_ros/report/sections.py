@@ -14,13 +14,7 @@ from typing import TYPE_CHECKING
 from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.report import figures
-from eschorty_ros.report.experiment import (
-    DataTable,
-    Effort,
-    Experiment,
-    Finding,
-    Outcome,
-)
+from eschorty_ros.report.experiment import DataTable, Effort, Experiment, Finding, Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -105,9 +105,7 @@ def _span(text: str) -> tuple[float, float]:
 
 
 def measure(
-    points: NDArray[np.void],
-    regions: tuple[Region, ...] = (),
-    common_mm: float | None = None,
+    points: NDArray[np.void], regions: tuple[Region, ...] = (), common_mm: float | None = None
 ) -> Measured:
     """Return planes, flatness and what lies between them.
 
@@ -211,10 +209,7 @@ def _pair(first: Surface, other: Surface) -> Pair:
     return Pair(
         _distance(first.part, other.part, common_mm),
         _angle(first.plane, other.plane),
-        Value(
-            (far - near) * cosine,
-            math.hypot(near_sigma, far_sigma) * cosine,
-        ),
+        Value((far - near) * cosine, math.hypot(near_sigma, far_sigma) * cosine),
         gap,
     )
 

@@ -273,12 +273,7 @@ def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> 
     metres = transform.copy()
     metres[:3, 3] = (transform[:3, 3] + origin_mm - transform[:3, :3] @ origin_mm) * 1e-3
     return Pose(
-        metres,
-        pairs.centre + origin_mm,
-        covariance,
-        len(pairs.ours),
-        pairs.overlap,
-        rms_sigmas,
+        metres, pairs.centre + origin_mm, covariance, len(pairs.ours), pairs.overlap, rms_sigmas
     )
 
 

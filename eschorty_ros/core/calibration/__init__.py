@@ -2,12 +2,7 @@
 
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.calibration.calibrate import METHODS, CalibrationReport, Method, calibrate
-from eschorty_ros.core.calibration.fit import (
-    K_PRIOR_SHARE,
-    PRIOR_SIGMA,
-    CalibrationFit,
-    fit,
-)
+from eschorty_ros.core.calibration.fit import K_PRIOR_SHARE, PRIOR_SIGMA, CalibrationFit, fit
 from eschorty_ros.core.calibration.moving_target import moving_target
 from eschorty_ros.core.calibration.post_finder import Post, find_posts
 from eschorty_ros.core.calibration.post_matching import KnownTarget, match_posts

@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.modulation.modulation import (
-    FREQUENCY_MAX_HZ,
-    FREQUENCY_MIN_HZ,
-    Modulation,
-)
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase
 
 _BIN_US = 10

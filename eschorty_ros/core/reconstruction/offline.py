@@ -22,10 +22,7 @@ from eschorty_ros.core.reconstruction.clock_wraps import in_wrap
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
-from eschorty_ros.core.reconstruction.recording_warnings import (
-    recording_warnings,
-    shown_modulation,
-)
+from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings, shown_modulation
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map

@@ -69,11 +69,7 @@ def decode_all(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArr
 
 
 def reconstruct(
-    t_us: ArrayLike,
-    column: ArrayLike,
-    row: ArrayLike,
-    model: RangeModel,
-    modulation: Modulation,
+    t_us: ArrayLike, column: ArrayLike, row: ArrayLike, model: RangeModel, modulation: Modulation
 ) -> Profiles:
     """Return the column means of every modulation period.
 

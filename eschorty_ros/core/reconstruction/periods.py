@@ -29,10 +29,7 @@ class PeriodCutter:
     """
 
     def __init__(
-        self,
-        modulation: Modulation,
-        every: int,
-        assembler: ProfileAssembler | WindowAssembler,
+        self, modulation: Modulation, every: int, assembler: ProfileAssembler | WindowAssembler
     ) -> None:
         self.lock = PhaseLock(modulation, every)
         self._modulation = modulation

@@ -263,11 +263,7 @@ def without_modulation(events: int, frequency_hz: float) -> str:
 
 
 def _few_points(
-    settings: Settings,
-    counters: Mapping[str, int],
-    points: Points,
-    dark: str,
-    modulated: bool,
+    settings: Settings, counters: Mapping[str, int], points: Points, dark: str, modulated: bool
 ) -> list[str]:
     """Return the largest loss where it left few points or none, ``dark`` where there is none."""
     if 2 * max(counters["events_gated"], counters["events_outside_roi"]) > counters["events"]:

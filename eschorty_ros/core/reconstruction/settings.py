@@ -10,13 +10,7 @@ from typing import Any, Self
 
 from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.line import (
-    CENTROIDS,
-    RETURNS,
-    SIGMA_COMMON_PX,
-    SIGMA_FLOOR_PX,
-    check_method,
-)
+from eschorty_ros.core.line import CENTROIDS, RETURNS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX, check_method
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US
 from eschorty_ros.core.reconstruction.profile_length import periods_max

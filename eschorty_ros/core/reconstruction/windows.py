@@ -63,11 +63,7 @@ class WindowAssembler:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        model: RangeModel,
-        jobs: int,
-        each: Callable[[LineRows], None],
+        self, settings: Settings, model: RangeModel, jobs: int, each: Callable[[LineRows], None]
     ) -> None:
         self._each = each
         self._model = model

@@ -13,12 +13,7 @@ from dataclasses import dataclass, fields, replace
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.simulation.pixels.parameters import PixelParameters
 
-LIMITS = {
-    "diff_on": (-85, 140),
-    "diff_off": (-35, 190),
-    "fo": (-35, 55),
-    "refr": (-20, 235),
-}
+LIMITS = {"diff_on": (-85, 140), "diff_off": (-35, 190), "fo": (-35, 55), "refr": (-20, 235)}
 """Offsets that the IMX636 accepts."""
 
 THRESHOLD_SCALE = 120.0

@@ -34,8 +34,7 @@ class Mesh(UniformReflectance):
         self._tensor: Any = o3d.core.Tensor
         self._caster: Any = o3d.t.geometry.RaycastingScene()
         self._caster.add_triangles(
-            self._tensor(np.ascontiguousarray(vertices_m, dtype=np.float32)),
-            self._tensor(faces),
+            self._tensor(np.ascontiguousarray(vertices_m, dtype=np.float32)), self._tensor(faces)
         )
 
     @classmethod

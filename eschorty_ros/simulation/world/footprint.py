@@ -141,8 +141,5 @@ def _edges(
     edge_mm = 0.5 * (stages[at] + stages[at + 1]) - stage_mm
     beyond = np.where(edge_mm > 0.0, at + 1, at)
     return _Edges(
-        edge_mm[sharp],
-        row[beyond, each][sharp],
-        reflectance[beyond, each][sharp],
-        columns[sharp],
+        edge_mm[sharp], row[beyond, each][sharp], reflectance[beyond, each][sharp], columns[sharp]
     )

@@ -158,11 +158,7 @@ class LaserTimeline:
         self.forget_before = self._gates.forget_before
 
     def set(
-        self,
-        t_us: int,
-        on: bool,
-        modulation: Modulation | None,
-        clock_rate: Fraction = Fraction(1),
+        self, t_us: int, on: bool, modulation: Modulation | None, clock_rate: Fraction = Fraction(1)
     ) -> None:
         """Switch from ``t_us`` on; replaces settings of later times.
 
