@@ -126,10 +126,10 @@ def byte_view(name: str, data: Any) -> memoryview:
     return view.cast("B")
 
 
-def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
-    """Return the common shape of ``arrays``."""
+def broadcast(names: str, *arrays: NDArray[Any]) -> None:
+    """Refuse ``arrays`` without a common shape."""
     try:
-        return np.broadcast_shapes(*(array.shape for array in arrays))
+        np.broadcast_shapes(*(array.shape for array in arrays))
     except ValueError:
         shapes = " and ".join(str(array.shape) for array in arrays)
         raise ArgumentError(f"{names} have shapes {shapes}; give shapes that fit") from None

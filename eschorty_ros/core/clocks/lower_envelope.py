@@ -53,8 +53,8 @@ class LowerEnvelope:
         """Return the count of points in the window."""
         return len(self._points)
 
-    def observe(self, t_us: int, arrival_ns: int) -> ClockLine:
-        """Add the arrival of an event of sensor time ``t_us``, which never falls; return `line`."""
+    def observe(self, t_us: int, arrival_ns: int) -> None:
+        """Add the arrival of the event of sensor time ``t_us``; times must not go back."""
         points = self._points
         bin_ = t_us // self._bin_us
         if not points or points[-1][0] != bin_:
@@ -71,7 +71,6 @@ class LowerEnvelope:
         if late_ns <= 0:
             self.line = self.line.shifted(late_ns)
             self.touched_us = t_us
-        return self.line
 
     def _fit(self) -> ClockLine:
         _, t, arrival = np.array(self._points, dtype=np.int64).T
