@@ -53,7 +53,7 @@ def depth_of_field_mm(
     f_number: float,
     theta_deg: float,
     theta_prime_deg: float,
-    pixel_um: float,
+    pixel_um: float = PIXEL_UM,
 ) -> Array:
     """Return half the depth of field along the sheet, mm (Eq. 3).
 
@@ -203,8 +203,8 @@ class RangeModel:
         """Return ``u``: 0 at the principal column, 1 half a sensor further, any shape."""
         return np.asarray((reals("column", column) - self.principal_column) / (0.5 * self.columns))
 
-    def row_offset_px(self, column: ArrayLike | None) -> Array:
-        """Return ``b'`` in these columns, px, any shape; in the principal column for ``None``."""
+    def row_offset_px(self, column: ArrayLike | None = None) -> Array:
+        """Return ``b'`` in these columns, px, any shape; in the principal column by default."""
         if column is None:
             return np.asarray(self.b_prime_px)
         u = self.normalised_column(column)
