@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import decimals, show, table
-from eschorty_ros.cli.files import OUT_FILE, report_replaced
+from eschorty_ros.cli.files import OUT_FILE, check_output, check_picture, report_replaced
 from eschorty_ros.cli.options import Number, refuse_given
 
 if TYPE_CHECKING:
@@ -98,6 +98,11 @@ def command(
         refuse_given(["wavelength_nm"], "belongs to --power-mw")
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
+    for out in outs:
+        if _is_build(out):
+            check_output(out)
+        else:
+            check_picture(out)
     given: dict[str, Any] = {
         "focal_length_mm": focal_mm,
         "f_number": f_number,
@@ -124,12 +129,16 @@ def command(
     if light:
         click.echo(light)
     for out in outs:
-        if out.suffix in (".yaml", ".yml"):
+        if _is_build(out):
             report_replaced(out)
             save_calibration(build.calibration(out.stem), out)
         else:
             _draw(build, np.linspace(near, last, 400), out)
         click.echo(str(out))
+
+
+def _is_build(out: Path) -> bool:
+    return out.suffix in (".yaml", ".yml")
 
 
 def _light(

@@ -23,6 +23,15 @@ def check_output(out: Path, *inputs: Path) -> None:
     check_writable(out)
 
 
+def check_picture(out: Path, *inputs: Path) -> None:
+    """Refuse a picture that cannot be written, or whose extension names no form of one."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    if out.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
+        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose .png, .pdf or .svg")
+    check_output(out, *inputs)
+
+
 def report_replaced(path: Path) -> None:
     """Print which older result is replaced."""
     if path.is_file():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import show, table, warn
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_picture, json_option
 from eschorty_ros.cli.options import Number
 from eschorty_ros.surfaces.plane import COMMON_SHARE
 
@@ -67,6 +67,8 @@ def command(
     from eschorty_ros.surfaces.measure import measure, parse_region
 
     chosen = tuple(parse_region(text) for text in regions)
+    if out is not None:
+        check_picture(out, cloud)
     points = read_cloud(cloud)
     measured = measure(points, chosen, common_mm)
     if as_json:

@@ -63,13 +63,15 @@ def command(
       eschorty register front.pcd side.pcd --start 0 30 0 0 0 15 --out both.ply
     """  # noqa: D301
     from eschorty_ros.core.base.errors import ArgumentError
-    from eschorty_ros.core.storage import read_cloud, write_cloud
+    from eschorty_ros.core.storage import is_cloud, read_cloud, write_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import joined_figure
     from eschorty_ros.surfaces.register import POOR_SIGMAS, join, pose_matrix, register
 
     if len(clouds) < 2 or len(starts) > len(clouds) - 1:
         raise click.UsageError("give two clouds or more, and at most one --start for each further")
+    if not is_cloud(out):
+        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose .pcd or .ply")
     check_output(out, *clouds)
     parts = [read_cloud(path) for path in clouds]
     joined, poses, sizes = parts[0], [], [len(parts[0])]

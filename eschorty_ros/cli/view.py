@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar, warn
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, check_picture
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import page_options, refuse_given
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
@@ -78,8 +78,16 @@ def command(
         raise click.UsageError("--out is the picture; --window, --browser and --live draw none")
     if cloud is None:
         _serve_instrument(allow_scan, host, port)
+    elif window:
+        _open_window(_read(cloud)[0], cloud.name)
+    elif browser:
+        from eschorty_ros.viewer.page import open_when_served
+
+        points, _ = _read(cloud)
+        open_when_served(host, port)
+        serve_cloud(points, host, port)
     else:
-        _show(cloud, out, window, (host, port) if browser else None)
+        _draw(cloud, out or cloud.with_suffix(".png"))
 
 
 def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
@@ -96,26 +104,26 @@ def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
         raise DeviceError("the viewer ended with an error; see the message above")
 
 
-def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | None) -> None:
+def _read(cloud: Path) -> tuple[Points, bool]:
+    """Return the points that can be drawn, and whether the cloud is one of this package."""
     from eschorty_ros.core.storage import read_cloud
-    from eschorty_ros.viewer.page import open_when_served
 
     try:
-        points, own = read_cloud(cloud), True
+        return _drawable(read_cloud(cloud), cloud), True
     except OtherFormatError:
-        points, own = _read_other(cloud), False
-    points = _drawable(points, cloud)
-    if window:
-        _open_window(points, cloud.name)
-        return
-    if page is not None:
-        open_when_served(*page)
-        serve_cloud(points, *page)
-        return
+        return _drawable(_read_other(cloud), cloud), False
+
+
+def _draw(cloud: Path, target: Path) -> None:
     from eschorty_ros.report import figures
 
-    target = out or cloud.with_suffix(".png")
-    if target.suffix.lower() == ".gif":
+    grows = target.suffix.lower() == ".gif"
+    if grows:
+        check_output(target, cloud)
+    else:
+        check_picture(target, cloud)
+    points, own = _read(cloud)
+    if grows:
         _draw_growing(points, own, target)
     else:
         draw = figures.scan_figure if own else figures.cloud_figure

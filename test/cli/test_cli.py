@@ -165,6 +165,36 @@ def test_an_unwritable_output_is_refused_before_the_work(monkeypatch, recording,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("command", "out", "words"),
+    [
+        ("measure", "a.txt", "choose .png, .pdf or .svg"),
+        ("measure", "missing/a.png", "cannot write"),
+        ("view", "a.txt", "choose .png, .pdf or .svg"),
+        ("view", "missing/a.gif", "cannot write"),
+        ("view", "flat.pcd", "choose .png, .pdf or .svg"),
+        ("mesh", "a.txt", "choose .ply, .obj, .stl"),
+        ("register", "a.txt", "choose .pcd or .ply"),
+        ("register", "missing/a.pcd", "cannot write"),
+        ("register", "flat.pcd", "is the cloud to read"),
+    ],
+)
+def test_an_output_is_refused_before_a_cloud_is_read(monkeypatch, cloud, command, out, words):
+    def work(*_arguments):
+        raise AssertionError("work before the refusal")
+
+    monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", work)
+    clouds = [cloud] * (2 if command == "register" else 1)
+    assert_fails_in_one_line(run(command, *clouds, "--out", cloud.parent / out), words)
+    assert list(cloud.parent.iterdir()) == [cloud]
+
+
+def test_one_bad_output_of_a_design_is_refused_before_the_others_are_written(tmp_path):
+    outs = ("--out", tmp_path / "a.yaml", "--out", tmp_path / "a.txt")
+    assert_fails_in_one_line(run("design", *outs), "choose .png, .pdf or .svg")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_terminal_without_a_degree_sign_still_gets_its_table():
     done = without_ros("design", PYTHONIOENCODING="ascii")
     assert done.returncode == 0, done.stderr
