@@ -50,7 +50,7 @@ class DelayedLaser:
     def readback(self) -> LaserReadback:
         self._wait("readback")
         output = LaserOutput.ON if self.lit else LaserOutput.OFF
-        return LaserReadback(output, self.modulation, None, 0)
+        return LaserReadback(output, self.modulation, 0)
 
     def close(self) -> None:
         self.disable()

@@ -114,14 +114,12 @@ class LaserOutput(IntEnum):
 class LaserReadback:
     """Output and settings as the generator reports them.
 
-    ``phase_epoch_ns`` is the time of one rising edge, ``None`` where the generator does not report
-    its phase. ``reason`` names the cause of an output that is off or unknown, ``""`` without one.
-    ``warnings`` are all oddities since opening that are no failure, ``counters`` go to diagnostics.
+    ``reason`` names the cause of an output that is off or unknown, ``""`` without one. ``warnings``
+    are all oddities since opening that are no failure, ``counters`` go to diagnostics.
     """
 
     output: LaserOutput
     modulation: Modulation
-    phase_epoch_ns: int | None
     output_since_ns: int
     reason: str = ""
     warnings: tuple[str, ...] = field(default=(), compare=False)
@@ -168,7 +166,7 @@ class StageState:
     t_ns: int
     homed: bool
     moving: bool
-    flags: tuple[str, ...] = field(default=())
+    flags: tuple[str, ...] = ()
 
 
 class LinearStage(Protocol):

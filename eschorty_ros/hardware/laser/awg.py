@@ -211,7 +211,6 @@ class AwgLaser:
             return LaserReadback(
                 self._output,
                 self._modulation,
-                None,
                 self._since_ns,
                 self._reason,
                 tuple(self._warnings),

@@ -283,7 +283,6 @@ class LaserNode(DeviceNode):
             waveform=readback.modulation.waveform,
             frequency=readback.modulation.frequency_hz,
             duty=readback.modulation.duty,
-            phase_epoch=stamp_from_ns(readback.phase_epoch_ns or 0),
             output_since=stamp_from_ns(readback.output_since_ns),
             reason=status.reason,
         )

