@@ -44,17 +44,14 @@ BIASES: Mapping[str, BiasInfo] = {
 class BiasBank:
     """Biases of an initialised sensor.
 
-    - ``wide``: Allow the wide ranges, which may make the sensor noisy or insensitive.
-
     Public attributes:
     - ``factory``: DAC values read before anything was written.
 
     Raises ``DeviceError`` when the camera does not answer.
     """
 
-    def __init__(self, registers: Registers, wide: bool = False) -> None:
+    def __init__(self, registers: Registers) -> None:
         self._registers = registers
-        self._wide = wide
         self.factory = {name: registers.read(info.address) & _DAC for name, info in BIASES.items()}
 
     def read(self) -> dict[str, int]:
@@ -65,17 +62,16 @@ class BiasBank:
         }
 
     def write(self, name: str, offset: int) -> int:
-        """Set one bias; returns the offset the camera reads back.
+        """Set one bias to an offset that ``CameraSettings`` accept; returns the one read back.
 
         The DAC is clamped to 0..255, so the offset read back may be nearer to 0.
 
-        Raises ``ArgumentError`` for an unknown name or an offset outside the range. Raises
-        ``DeviceError`` when the camera reads back another value than was written.
+        Raises ``DeviceError`` when the camera reads back another value than was written.
         """
-        info = check_offset(name, offset, self._wide)
+        address = BIASES[name].address
         dac = min(max(self.factory[name] + offset, 0), _DAC)
-        self._registers.write(info.address, ENABLED | dac)
-        kept = self._registers.read(info.address) & _DAC
+        self._registers.write(address, ENABLED | dac)
+        kept = self._registers.read(address) & _DAC
         if kept != dac:
             raise DeviceError(
                 f"camera: {name} was set to DAC {dac} and reads back {kept}; "
@@ -84,14 +80,16 @@ class BiasBank:
         return kept - self.factory[name]
 
 
-def check_offset(name: str, offset: int, wide: bool = False) -> BiasInfo:
-    """Return a bias's entry; raises ``ArgumentError`` for an unknown name or wrong offset."""
+def check_offset(name: str, offset: int, wide: bool) -> None:
+    """Raise ``ArgumentError`` for an unknown bias or an offset outside its range.
+
+    - ``wide``: Allow the wide range, which may make the sensor noisy or insensitive.
+    """
     if name not in BIASES:
         raise ArgumentError(f"bias {name!r} is unknown; choose one of {', '.join(BIASES)}")
     low, high = BIASES[name].wide if wide else BIASES[name].normal
     if not low <= offset <= high:
         raise ArgumentError(f"{name} is {offset}; choose {low} to {high}")
-    return BIASES[name]
 
 
 def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:

@@ -63,7 +63,7 @@ class Session:
         try:
             self.identity = self._identify()
             self._initialise()
-            self._biases = BiasBank(self.control, settings.wide_biases)
+            self._biases = BiasBank(self.control)
             self.applied = apply_settings(self.control, self._biases, settings)
             self.reader: BulkReader = make_reader(
                 backend, self._usb.device, self._usb.endpoints.data_in, clock_ns

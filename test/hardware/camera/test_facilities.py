@@ -9,6 +9,7 @@ from eschorty_ros.hardware.camera import event_rate, event_trail, monitors
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
 from eschorty_ros.hardware.camera.biases import BIASES, BiasBank, load_bias_file, save_bias_file
 from eschorty_ros.hardware.camera.pixel_selection import set_hot_pixels, set_windows, windows_of
+from eschorty_ros.hardware.camera.settings import CameraSettings
 
 FACTORY = {0x1004: 0x11A1_0053, 0x100C: 0x11A1_0000, 0x1010: 0x11A1_0066, 0x1018: 0x11A1_0049}
 
@@ -35,9 +36,9 @@ def registers() -> RegisterFile:
     return RegisterFile()
 
 
-def bank(wide: bool = False) -> tuple[RegisterFile, BiasBank]:
+def bank() -> tuple[RegisterFile, BiasBank]:
     registers = RegisterFile({**FACTORY, 0x1020: 0x11A1_0014})
-    return registers, BiasBank(registers, wide)
+    return registers, BiasBank(registers)
 
 
 def test_bias_is_an_offset_from_the_factory_trim() -> None:
@@ -50,7 +51,7 @@ def test_bias_is_an_offset_from_the_factory_trim() -> None:
 
 
 def test_bias_beyond_the_dac_reads_back_what_the_camera_holds() -> None:
-    registers, biases = bank(wide=True)
+    registers, biases = bank()
     assert biases.write("bias_fo", -150) == -0x53
     assert biases.write("bias_refr", 255) == 255 - 0x14
     assert registers.values[0x1020] & 0xFF == 255
@@ -58,12 +59,10 @@ def test_bias_beyond_the_dac_reads_back_what_the_camera_holds() -> None:
 
 @pytest.mark.parametrize("name", BIASES)
 def test_bias_outside_its_range_is_refused(name: str) -> None:
-    registers, biases = bank()
-    low, high = BIASES[name].normal
-    for offset in (low - 1, high + 1):
-        with pytest.raises(ArgumentError, match=f"{name} is {offset}; choose {low} to {high}"):
-            biases.write(name, offset)
-    assert registers.writes == []
+    for wide, (low, high) in ((False, BIASES[name].normal), (True, BIASES[name].wide)):
+        for offset in (low - 1, high + 1):
+            with pytest.raises(ArgumentError, match=f"{name} is {offset}; choose {low} to {high}"):
+                CameraSettings(biases={name: offset}, wide_biases=wide)
 
 
 def test_bias_the_camera_does_not_keep_is_an_error() -> None:
