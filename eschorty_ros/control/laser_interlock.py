@@ -111,7 +111,7 @@ class LaserInterlock:
             if is_open or source in self._closed_s or len(self._closed_s) < _KEPT:
                 self._closed_s[source] = None if is_open else self._now_s()
 
-    def reset_contact(self, living: Collection[str] | None = None) -> str:
+    def reset_contact(self, living: Collection[str]) -> str:
         """Undo the latch of an opened contact; return why that is refused, ``""`` when it is not.
 
         It is while a source reports it open, or its report of closed has expired. A source whose
@@ -119,10 +119,9 @@ class LaserInterlock:
         closed: it is dropped.
         """
         with self._contact_lock:
-            if living is not None:
-                for source in self._nameless.difference(living):
-                    self._closed_s.pop(source, None)
-                    self._nameless.discard(source)
+            for source in self._nameless.difference(living):
+                self._closed_s.pop(source, None)
+                self._nameless.discard(source)
             fault = self._source_fault()
             if not fault:
                 self._opened_by = ""

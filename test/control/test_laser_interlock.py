@@ -88,7 +88,7 @@ def test_a_source_whose_name_is_discovered_later_is_one_source(clock):
     interlock.receive_contact(True, "door", "0a1b")
     assert "interlock open (door)" in interlock.contact_fault()
     interlock.receive_contact(False, "door", "0a1b")
-    assert not interlock.reset_contact()
+    assert not interlock.reset_contact(())
     assert not interlock.contact_open
 
 
@@ -113,22 +113,22 @@ def test_every_source_must_be_closed_and_fresh_and_an_opened_one_reset(clock):
     interlock.receive_contact(True, "door")
     interlock.receive_contact(False, "lid")
     assert interlock.contact_fault() == "interlock open (door); close it"
-    assert interlock.reset_contact() == "interlock open (door); close it"
+    assert interlock.reset_contact(()) == "interlock open (door); close it"
     interlock.receive_contact(False, "door")
     assert "was opened (door); call laser/reset_interlock" in interlock.contact_fault()
     clock.now_s += 0.6
     interlock.receive_contact(False, "door")
     clock.now_s += 0.6
-    assert "interlock open (lid): closed was last reported" in interlock.reset_contact()
+    assert "interlock open (lid): closed was last reported" in interlock.reset_contact(())
     interlock.receive_contact(False, "lid")
     assert interlock.contact_open
-    assert interlock.reset_contact() == ""
+    assert interlock.reset_contact(()) == ""
     assert not interlock.contact_open
     # More sources than are kept: closed ones do not displace the others, an open one counts.
     for number in range(100):
         interlock.receive_contact(False, f"crowd {number}")
     interlock.receive_contact(True, "the last")
-    assert interlock.reset_contact() == "interlock open (the last); close it"
+    assert interlock.reset_contact(()) == "interlock open (the last); close it"
     interlock.receive_contact(False, "the last")
     assert "was opened (the last)" in interlock.contact_fault()
 
@@ -200,7 +200,7 @@ def test_an_opening_while_the_latch_is_reset_stays_latched():
 
     opens_and_closes()
     reports.append(threading.Thread(target=opens_and_closes))
-    assert interlock.reset_contact() == ""
+    assert interlock.reset_contact(()) == ""
     reports[0].join(5.0)
     assert interlock.contact_fault() == "interlock was opened (door); call laser/reset_interlock"
 

@@ -67,7 +67,7 @@ class Axis:
         position_mm: float,
         travel_mm: tuple[float, float],
         on_plan: Callable[[MotionPlan], None],
-        sampled_pulses: bool = False,
+        sampled_pulses: bool,
     ) -> None:
         self.travel_mm = travel_mm
         self.obstacle_mm: float | None = None

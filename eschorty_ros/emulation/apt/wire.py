@@ -50,7 +50,7 @@ class Disturbance:
     - ``repeats``: Frames still to be sent twice.
     """
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int) -> None:
         self.garbage = b""
         self.loss_share = 0.0
         self.flips = 0

@@ -70,9 +70,7 @@ def _receive(link: socket.socket, size: int) -> bytearray:
     return data
 
 
-def send_request(
-    link: socket.socket, op: Op, numbers: tuple[int, ...] = (), data: bytes = b""
-) -> None:
+def send_request(link: socket.socket, op: Op, numbers: tuple[int, ...], data: bytes) -> None:
     """Send a request; missing numbers are 0."""
     padded = (*numbers, 0, 0, 0, 0)[:4]
     link.sendall(_REQUEST.pack(op, *padded, len(data)) + data)

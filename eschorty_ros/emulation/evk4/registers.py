@@ -58,7 +58,7 @@ class Registers:
     - ``temperature_c``: Temperature that the sensor reports.
     """
 
-    def __init__(self, factory_dacs: Mapping[str, int] | None = None):
+    def __init__(self, factory_dacs: Mapping[str, int] | None):
         self.factory_dacs = {**_FACTORY_DACS, **(factory_dacs or {})}
         self.temperature_c = 35.0
         self._values: dict[int, int] = {}

@@ -92,7 +92,7 @@ class SequenceWatch:
     - ``violations``: Broken sequences, sequences in the wrong phase, short waits.
     """
 
-    def __init__(self, clock_ns: Callable[[], int] | None = None):
+    def __init__(self, clock_ns: Callable[[], int] | None):
         self._clock_ns = clock_ns
         self.phase = Phase.OFF
         self.violations: list[str] = []

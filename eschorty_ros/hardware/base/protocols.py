@@ -166,7 +166,7 @@ class StageState:
     t_ns: int
     homed: bool
     moving: bool
-    flags: tuple[str, ...] = ()
+    flags: tuple[str, ...]
 
 
 class LinearStage(Protocol):

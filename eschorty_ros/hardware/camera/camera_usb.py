@@ -132,7 +132,7 @@ class CameraUsb:
         bus.release(self.device, _INTERFACE, reattach=self._reattach)
 
 
-def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
+def open_camera(backend: usb.backend.IBackend, serial: str) -> CameraUsb:
     """Claim the camera with that serial (hex, upper or lower case), or the only one on the bus.
 
     The serial is read over the control protocol, because USB descriptors need not hold it.

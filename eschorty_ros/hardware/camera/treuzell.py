@@ -40,7 +40,7 @@ class ControlLink(Protocol):
         """Clear stalls and discard waiting answers."""
 
 
-def request_frame(property_id: int, payload: bytes = b"") -> bytes:
+def request_frame(property_id: int, payload: bytes) -> bytes:
     """Return the frame of a request."""
     return _HEADER.pack(property_id, len(payload)) + payload
 

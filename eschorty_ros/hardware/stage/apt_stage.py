@@ -39,7 +39,7 @@ MakeLink = Callable[[Callable[[apt.Frame, int], None], Callable[[DeviceError], N
 
 
 def open_stage(
-    settings: AptSettings, clock_ns: Callable[[], int], port: str = "", serial: str = ""
+    settings: AptSettings, clock_ns: Callable[[], int], port: str, serial: str
 ) -> AptStage:
     """Return the stage on ``port``, or on the port whose USB serial number is ``serial``.
 

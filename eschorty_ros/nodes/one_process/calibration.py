@@ -30,10 +30,10 @@ class CalibrationJob:
     """The known targets of the scene."""
     folder: str
     """Folder for the calibration."""
-    calibration: str = "config_3"
-    as_built: str = "config_3_as_built"
+    calibration: str
+    as_built: str
     """The build as designed, and that of the simulated world."""
-    method: str = "joint"
+    method: str
     capture_s: float = 1.0
 
 

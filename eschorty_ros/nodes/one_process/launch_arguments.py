@@ -111,9 +111,9 @@ class Description:
     nodes: Tables
     """Parameters by node; those of ``file`` override them."""
     file: str
-    bench: dict[str, str] | None = None
+    bench: dict[str, str] | None
     """Options of ``eschorty-bench``; ``None`` without an emulated bench."""
-    view: str = ""
+    view: str
     """RViz's view to show; empty for none."""
 
 

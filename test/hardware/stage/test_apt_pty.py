@@ -41,7 +41,7 @@ def port(model: AptModel, tmp_path: Path) -> Iterator[str]:
 def opened(port: str) -> contextlib.closing[AptStage]:
     """The driver on this port, closed at the end of a ``with``."""
     settings = AptSettings(homing_mm_s=25.0)
-    return contextlib.closing(open_stage(settings, time.monotonic_ns, port))
+    return contextlib.closing(open_stage(settings, time.monotonic_ns, port, ""))
 
 
 def homed(stage: AptStage) -> None:
