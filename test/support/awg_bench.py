@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from output_log import read_output_log
+
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
+from eschorty_ros.emulation.awg.model import AwgModel
 from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.hardware.laser.awg import AwgLaser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings

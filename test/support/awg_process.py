@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from command_process import CommandProcess, run_commands
+from output_log import read_output_log
 from short_folder import short_folder
 from waiting import wait_until
 
-from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
+from eschorty_ros.emulation.awg.model import AwgModel
 from eschorty_ros.emulation.bus import UsbServer
 from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
 

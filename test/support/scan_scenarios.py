@@ -12,12 +12,12 @@ from action_msgs.msg import GoalStatus
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
+from output_log import read_output_log
 from ros_process import Observer, ros_minus_steady_ns, stamped_after, wait_until
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import POINT_DTYPE
-from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message

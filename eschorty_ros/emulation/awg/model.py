@@ -329,9 +329,3 @@ class AwgModel(EmulatedUsbDevice):
         waveform = _WAVEFORMS.get(state.wave, "square")
         duty = 0.5 if waveform == "sine" else state.duty_percent / 100.0
         return Modulation(frequency_hz, 1.0 - duty if state.inversion else duty, waveform)
-
-
-def read_output_log(log_path: str | Path) -> list[tuple[int, str]]:
-    """Return the lines of a log: monotonic ns and ON or OFF, in order."""
-    lines = Path(log_path).read_text(encoding="ascii").splitlines()
-    return [(int(t_ns), state) for t_ns, state in (line.split() for line in lines)]

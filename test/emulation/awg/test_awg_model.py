@@ -5,8 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from output_log import read_output_log
 
-from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, read_output_log
+from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel
 from eschorty_ros.emulation.bus import UsbFault
 
 Exchange = Callable[[str], str]

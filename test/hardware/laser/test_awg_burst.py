@@ -6,11 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 from awg_bench import AwgBench
+from output_log import read_output_log
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.base.files import config_folders
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser import awg
 from eschorty_ros.hardware.laser.awg import UNBOUNDED, AwgLaser

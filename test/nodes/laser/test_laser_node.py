@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from eschorty_ros.msg import LaserState
 from laser_bench import OFF_LIMIT_S, LaserBench
+from output_log import read_output_log
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_after, wait_until
 from std_msgs.msg import Header
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
-from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 

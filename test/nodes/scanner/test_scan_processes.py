@@ -12,10 +12,10 @@ from action_msgs.msg import GoalStatus
 from benches import remote_bench
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
+from output_log import read_output_log
 from ros_process import NodeProcess, node_name, processes
 from waiting import wait_until
 
-from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.nodes.ros.domain import free_domain
 
 SCANNER = "eschorty_ros.nodes.scanner.node"
