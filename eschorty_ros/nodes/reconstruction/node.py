@@ -51,7 +51,7 @@ from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.frames import frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
-from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
+from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s, publishers_fault
 from eschorty_ros.nodes.ros.spin import run
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
@@ -179,14 +179,12 @@ class ReconstructionNode(Node):
         self._scans = ScanServices(
             self,
             self._pipeline,
-            lambda: ("camera/events", "stage/odom", *(() if self._override else ("laser/state",))),
-            self._stage,
+            self._scan_fault,
             self._in_worker,
             self._running,
             self.parameters["stage_timeout"],
             self._publish_scan,
             self._recorder,
-            short,
         )
         self._tf: Any = None
         if self.parameters["publish_tf"]:
@@ -272,6 +270,19 @@ class ReconstructionNode(Node):
         if capture is not None:
             self._camera_roi.check_full()
         self._pipeline.set_capture(capture)
+
+    def _scan_fault(self) -> tuple[str, bool]:
+        """Return why no scan can begin, ``""`` when one can, and whether it is the stage's topic.
+
+        A stage that was killed counts as a publisher for some time.
+        """
+        events, odometry = (
+            publishers_fault(self, topic) for topic in ("camera/events", "stage/odom")
+        )
+        laser = "" if self._override else publishers_fault(self, "laser/state")
+        silence = self._stage.silence_fault(self, "stage/odom")
+        faults = (events, odometry, laser, silence)
+        return "; ".join(fault for fault in faults if fault), bool(odometry or silence)
 
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -22,7 +22,8 @@ from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import UINT32_MAX, check_text, saturated
 from eschorty_ros.nodes.ros.conversions import mm_from_m
-from eschorty_ros.nodes.ros.peers import OnePublisher, publishers_fault
+from eschorty_ros.nodes.ros.executor import ShortGroup
+from eschorty_ros.nodes.ros.peers import OnePublisher
 from eschorty_ros.nodes.ros.repeated_call import RESEND_S
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.srv import BeginScan, EndScan
@@ -41,32 +42,27 @@ class ScanServices:
     """Services that begin and end scans in the worker thread and wait for it.
 
     - ``pipeline``: Used by the worker alone.
-    - ``topics``: Returns the topics that a scan needs one publisher of.
-    - ``stage``: Checks the publisher of ``stage/odom``, which must not be silent.
+    - ``fault``: Returns why no scan can begin, ``""`` when one can, and whether it may pass.
     - ``in_worker``: Runs a job in the worker; returns whether it succeeded, and the reason of a
       failure.
     - ``running``: Returns whether the worker runs.
     - ``stage_timeout_s``: Longest wait of points for the stage after the end.
     - ``publish``: Publishes a finished scan, given the ROS time (ns) for one without points.
     - ``recorder``: Returns a recorder for a scan's log, ``None`` when scans are not recorded.
-    - ``short``: Group of callbacks that wait for nothing.
     """
 
     def __init__(
         self,
         node: Node,
         pipeline: Pipeline,
-        topics: Callable[[], Sequence[str]],
-        stage: OnePublisher,
+        fault: Callable[[], tuple[str, bool]],
         in_worker: Callable[[Callable[[], None], float], tuple[bool, str]],
         running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
         recorder: Callable[[str, float, float, int], ScanRecorder | None],
-        short: CallbackGroup,
     ) -> None:
-        self._node, self._pipeline, self._topics = node, pipeline, topics
-        self._stage = stage
+        self._node, self._pipeline, self._fault = node, pipeline, fault
         self._in_worker, self._running = in_worker, running
         self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
@@ -74,7 +70,7 @@ class ScanServices:
         self._recorder: ScanRecorder | None = None
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
-        self._refused = "", "", -math.inf
+        self._refused: tuple[str, Any, float] = "", None, -math.inf
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
             (BeginScan, "reconstruction/begin_scan", self._on_begin),
@@ -84,6 +80,7 @@ class ScanServices:
         self._client = OnePublisher()
         self._sender: Sender | None = None
         self._begun_s, self._had_client = 0.0, False
+        short = ShortGroup()
         node.create_subscription(
             Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat(), callback_group=short
         )
@@ -103,40 +100,41 @@ class ScanServices:
 
     def _on_begin(self, request: Any, response: Any) -> Any:
         # A request that is repeated while the first one is refused must not begin the scan.
-        scan_id, reason, at_s = self._refused
+        scan_id, refusal, at_s = self._refused
         if request.scan_id == scan_id and time.monotonic() - at_s < RESEND_S:
-            response.success, response.message = False, reason
-            return response
+            return refusal
         response = self._begin(request, response)
         if not response.success:
-            self._refused = request.scan_id, response.message, time.monotonic()
+            self._refused = request.scan_id, response, time.monotonic()
         return response
 
     def _begin(self, request: Any, response: Any) -> Any:
         # A publisher may discover this node's subscriptions before they discover the publisher.
         # After the answer every message sent must arrive.
-        fault = self._fault()
+        response.message, response.retry = self._fault()
         deadline_s = time.monotonic() + _CONNECT_S
-        while fault and time.monotonic() < deadline_s and self._running():
+        while response.message and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
-            fault = self._fault()
-        if fault := fault or bare_name_fault("scan_id", request.scan_id):
-            response.success, response.message = False, fault
+            response.message, response.retry = self._fault()
+        scan_id = request.scan_id
+        response.message = response.message or bare_name_fault("scan_id", scan_id)
+        if response.message:
+            return response
+        # A request is repeated when its answer is lost.
+        if self._pipeline.scan_id == scan_id:
+            response.success = True
             return response
         limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
-        # A request is repeated when its answer is lost.
-        repeated = self._pipeline.scan_id == request.scan_id
-        recorder = self._recorder
-        if not repeated:
-            recorder = self._make_recorder(request.scan_id, *limits_mm, passes)
-            if recorder is not None and (fault := recorder.made(_RECORD_S)):
-                response.success, response.message = False, fault
-                return response
-        begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder, passes)
+        recorder = self._make_recorder(scan_id, *limits_mm, passes)
+        if recorder is not None:
+            response.message = recorder.made(_RECORD_S)
+        if response.message:
+            return response
+        begin = partial(self._pipeline.begin_scan, scan_id, *limits_mm, recorder, passes)
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         if response.success:
             self._recorder = recorder
-        elif recorder is not None and not repeated:
+        elif recorder is not None:
             recorder.end(None, response.message)
         return response
 
@@ -145,11 +143,6 @@ class ScanServices:
         self._pipeline.end_recording(None, "the node ended during the scan")
         if self._recorder is not None:
             self._recorder.wait(_RECORD_S)
-
-    def _fault(self) -> str:
-        faults = [publishers_fault(self._node, topic) for topic in self._topics()]
-        faults.append(self._stage.silence_fault(self._node, "stage/odom"))
-        return "; ".join(fault for fault in faults if fault)
 
     def _on_heartbeat(self, message: Header, info: Mapping[str, Any]) -> None:
         self._client.check(info)

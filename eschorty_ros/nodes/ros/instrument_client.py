@@ -56,8 +56,6 @@ from eschorty_ros.srv import BeginScan, EndScan
 _TICK_LIMIT_S = 1.0
 # Part of the laser's reason when a heartbeat is missing.
 _HEARTBEAT = "/heartbeat"
-# Part of the reconstruction's reason when the odometry has not one publisher that sends.
-_ODOMETRY = "stage/odom"
 # The middleware forgets a node that has been killed within 20 s.
 _DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
@@ -359,8 +357,7 @@ class ScanClient(InstrumentClient):
         self.monitor.restart_samples(self._now_ns())
         ends_s = time.monotonic() + _DEAD_S
         while not (answer := self._begun(begin)).success:
-            # A stage that has been killed counts as a publisher for some time.
-            if _ODOMETRY not in answer.message or time.monotonic() > ends_s:
+            if not answer.retry or time.monotonic() > ends_s:
                 raise ScanFailure(f"reconstruction: {answer.message}")
             self.tick()
 

@@ -51,6 +51,7 @@ def test_a_scan_begins_before_any_odometry_and_not_while_its_publisher_is_silent
     refused = begin(observer, "silent")
     assert not refused.success
     assert "nothing on /eschorty/stage/odom for" in refused.message
+    assert refused.retry
     odometry.publish(sample(observer))
     answer = begin(observer, "again")
     assert answer.success, answer.message
