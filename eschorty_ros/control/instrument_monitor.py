@@ -66,11 +66,11 @@ class InstrumentMonitor:
         self.limits: StageLimits | None = None
         self.laser: LaserReport | None = None
         self.reconstruction: ReconstructionStatus | None = None
-        self.position_mm = float("nan")
+        self.position_mm = math.nan
         self.at_rest = False
         self.until_ns = 0
-        self._laser_s = self._reconstruction_s = self._stage_s = self._advanced_s = 0.0
-        self._moved_s = 0.0
+        self._reported_s = dict.fromkeys(("laser", "stage", "reconstruction"), 0.0)
+        self._advanced_s = self._moved_s = 0.0
         # Another program's reconstruction may have no heartbeat.
         self._heartbeat_s = math.inf
         self._sender: Sender | None = None
@@ -79,7 +79,7 @@ class InstrumentMonitor:
 
     def update_laser(self, status: LaserReport, age_s: float) -> None:
         """Store the laser's newest status, which arrived ``age_s`` after its stamp."""
-        self.laser, self._laser_s = status, time.monotonic()
+        self.laser, self._reported_s["laser"] = status, time.monotonic()
         self._ages["laser"].add(age_s)
 
     def update_reconstruction(self, status: ReconstructionStatus, age_s: float) -> None:
@@ -90,7 +90,7 @@ class InstrumentMonitor:
             self._ages["camera"].add(status.packet_age_s)
         if status.processed_until_ns != self.until_ns:
             self.until_ns, self._advanced_s = status.processed_until_ns, now_s
-        self.reconstruction, self._reconstruction_s = status, now_s
+        self.reconstruction, self._reported_s["reconstruction"] = status, now_s
 
     def update_stage(
         self, t_ns: int, position_mm: float, velocity_mm_s: float, age_s: float
@@ -100,7 +100,7 @@ class InstrumentMonitor:
         if position_mm != self.position_mm:
             self._moved_s = now_s
         self.position_mm = position_mm
-        self._stage_s = now_s
+        self._reported_s["stage"] = now_s
         self._ages["stage"].add(age_s)
         self.at_rest = abs(velocity_mm_s) < _REST_MM_S
         # Those of the motion before may still come.
@@ -130,21 +130,16 @@ class InstrumentMonitor:
     @property
     def stage_reports(self) -> bool:
         """Return whether odometry is fresh."""
-        return _age_s(self._stage_s) < _STALE_S
+        return _age_s(self._reported_s["stage"]) < _STALE_S
 
     @property
     def laser_reports(self) -> bool:
         """Return whether the laser's state is fresh."""
-        return self.laser is not None and _age_s(self._laser_s) < _STALE_S
+        return self.laser is not None and _age_s(self._reported_s["laser"]) < _STALE_S
 
     def report_late(self, component: str) -> bool:
         """Return whether ``laser``, ``stage`` or ``reconstruction`` no longer reports."""
-        reported_s = {
-            "laser": self._laser_s,
-            "stage": self._stage_s,
-            "reconstruction": self._reconstruction_s,
-        }
-        return _age_s(reported_s.get(component, math.inf)) > _REPORT_TIMEOUT_S
+        return _age_s(self._reported_s.get(component, math.inf)) > _REPORT_TIMEOUT_S
 
     def restart_progress(self) -> None:
         """Count the time without progress of the reconstruction from now."""
@@ -190,7 +185,7 @@ class InstrumentMonitor:
 
     def cause_of_no_progress(self) -> str:
         """Return the component without which the reconstruction does not advance."""
-        if _age_s(self._reconstruction_s) > _STALE_S:
+        if _age_s(self._reported_s["reconstruction"]) > _STALE_S:
             return "reconstruction: it does not report"
         if not self._camera_present():
             return "camera: its node is gone, no events"
