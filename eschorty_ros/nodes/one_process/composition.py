@@ -25,6 +25,7 @@ from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.spin import end_nodes, signals_ignored
 from eschorty_ros.nodes.scanner.node import ScannerNode
@@ -32,7 +33,6 @@ from eschorty_ros.nodes.stage.node import StageNode
 from eschorty_ros.nodes.viewer.node import ViewerNode
 
 NAMESPACE = "/eschorty"
-DEVICES = ("camera", "laser", "stage")
 NODES = {
     "camera": CameraNode,
     "laser": LaserNode,
@@ -175,7 +175,7 @@ def composition(
         folder = ending.enter_context(temporary_folder())
         tables = {name: dict(table) for name, table in values.items()}
         if bench is not None:
-            for name in DEVICES:
+            for name in REAL:
                 tables.setdefault(name, {})["bench"] = str(folder / "bench")
             ending.enter_context(bench_process(folder / "bench", bench))
         file = folder / "parameters.yaml"

@@ -13,16 +13,16 @@ from eschorty_ros.core.base.yaml_file import read_yaml
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.camera import node as camera
 from eschorty_ros.nodes.laser import node as laser
+from eschorty_ros.nodes.one_process.composition import NAMESPACE
 from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters
 from eschorty_ros.nodes.replay import node as replay
-from eschorty_ros.nodes.ros import drivers, lifecycle
+from eschorty_ros.nodes.ros import lifecycle
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import check_name, from_settings, of_ros
 from eschorty_ros.nodes.scanner import node as scanner
 from eschorty_ros.nodes.stage import node as stage
 from eschorty_ros.nodes.viewer import node as viewer
 
-_NAMESPACE = "/eschorty/"
 _KEY = "ros__parameters"
 TABLES = {
     "camera": camera.TABLE,
@@ -60,14 +60,14 @@ def read_parameters(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     for full_name, table in data.items():
         where = document.at((full_name,))
         with _in_file(where):
-            check_name(full_name, "node", [f"{_NAMESPACE}{name}" for name in TABLES])
-        name = full_name.removeprefix(_NAMESPACE)
+            check_name(full_name, "node", [f"{NAMESPACE}/{name}" for name in TABLES])
+        name = full_name.removeprefix(f"{NAMESPACE}/")
         values = table.get(_KEY) if isinstance(table, dict) and set(table) == {_KEY} else None
         if not isinstance(values, dict):
             raise FormatError(
                 f"{where}: {full_name} is {short(table)}; write parameters under {_KEY} in it"
             )
-        started = [lifecycle.AUTO_START] if name in drivers.REAL else []
+        started = [lifecycle.AUTO_START] if name in REAL else []
         params = {param.name: param for param in (*TABLES[name], *started)}
         for parameter, value in values.items():
             if not of_ros(parameter):
