@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import pairs, progress_bar, show, table, warn
+from eschorty_ros.cli.console import of_total, pairs, progress_bar, show, table, warn
 from eschorty_ros.cli.files import OUT_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import Number, refuse_given
@@ -20,6 +21,7 @@ from eschorty_ros.core.optics import SHIPPED
 if TYPE_CHECKING:
     from eschorty_ros.core.calibration import CalibrationReport, KnownTarget, Method, Targets
     from eschorty_ros.core.optics import Calibration
+    from eschorty_ros.core.storage import Recording
 
 # Targets side by side in a profile of a moving target when roll or smile is fitted.
 _BLOCKS = 8
@@ -178,30 +180,35 @@ def command(
         _check_out(out)
         _calibrate_simulated(_known(distances, range_sigma), nominal, as_built, method, out)
         return
-    refuse_given(["as_built"], "belongs to --fake")
-    if all(source.is_dir() for source in sources):
-        refuse_given(["row_sigma"], "is for a targets.csv")
-    if moving is None:
-        refuse_given(["range_per_stage"], "belongs to --moving")
-    _check_usage(sources, out, distances, moving)
+    _check_sources(sources, distances, moving)
+    _check_out(out)
     priors = _priors(prior)
-    from eschorty_ros.core.calibration import COLUMN_TERMS, Targets, calibrate, read_targets
+    from eschorty_ros.core.calibration import (
+        COLUMN_TERMS,
+        Targets,
+        calibrate,
+        read_targets,
+        recorded_moving_target,
+    )
     from eschorty_ros.core.optics import load_calibration
 
     design = load_calibration(nominal)
-    made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
     # Roll and smile need several targets side by side.
     blocks = _BLOCKS if set(COLUMN_TERMS) & set(free) else 1
-    targets = Targets.concatenate(
-        [
-            _recorded(source, design, distances, moving, range_per_stage, range_sigma, blocks)
-            if source.is_dir()
-            else read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
-            for source in sources
-        ]
-    )
+
+    def targets_of(source: Path) -> Targets:
+        if not source.is_dir():
+            return read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
+        if moving is None:
+            return _posts(source, design, distances, range_sigma)
+        with _reading(source, design) as (recording, progress):
+            return recorded_moving_target(
+                recording, design, moving, range_per_stage=range_per_stage,
+                sigma_at_zero_mm=range_sigma, blocks=blocks, progress=progress,
+            )  # fmt: skip
+
     report = calibrate(
-        targets,
+        Targets.concatenate([targets_of(source) for source in sources]),
         design,
         method,
         free=free or None,
@@ -209,13 +216,16 @@ def command(
         robust=robust,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
-    _finish(report, made_with, out)
+    _finish(report, {"targets from": ", ".join(map(str, sources)), "design": nominal}, out)
 
 
-def _check_usage(
-    sources: tuple[Path, ...], out: Path, distances: str | None, moving: float | None
-) -> None:
-    _check_out(out)
+def _check_sources(sources: tuple[Path, ...], distances: str | None, moving: float | None) -> None:
+    """Refuse options that have no effect on these sources, or are missing, as wrong usage."""
+    refuse_given(["as_built"], "belongs to --fake")
+    if all(source.is_dir() for source in sources):
+        refuse_given(["row_sigma"], "is for a targets.csv")
+    if moving is None:
+        refuse_given(["range_per_stage"], "belongs to --moving")
     if not sources:
         raise click.UsageError("no SOURCE; give targets.csv, a recording, or --fake")
     folders = [source for source in sources if source.is_dir()]
@@ -247,17 +257,11 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
     return priors or None
 
 
-def _recorded(
-    source: Path,
-    design: Calibration,
-    distances: str | None,
-    moving: float | None,
-    range_per_stage: float,
-    range_sigma: float,
-    blocks: int,
-) -> Targets:
-    """Find the targets of a recording: posts, or one target moved by the stage."""
-    from eschorty_ros.core.calibration import recorded_moving_target, recorded_posts
+@contextlib.contextmanager
+def _reading(
+    source: Path, design: Calibration
+) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
+    """Give a recording and the report of what is read of it; warn where it is of another build."""
     from eschorty_ros.core.storage import load_recording
 
     recording = load_recording(source)
@@ -267,15 +271,14 @@ def _recorded(
             f"{design.name}; give the design that made it"
         )
     with progress_bar("reading") as report:
+        yield recording, of_total(report)
 
-        def progress(done: int, total: int) -> None:
-            report(done / max(total, 1), "")
 
-        if moving is not None:
-            return recorded_moving_target(
-                recording, design, moving, range_per_stage=range_per_stage,
-                sigma_at_zero_mm=range_sigma, blocks=blocks, progress=progress,
-            )  # fmt: skip
+def _posts(source: Path, design: Calibration, distances: str | None, range_sigma: float) -> Targets:
+    """Return the posts that are found in a recording; print which are left out."""
+    from eschorty_ros.core.calibration import recorded_posts
+
+    with _reading(source, design) as (recording, progress):
         match = recorded_posts(recording, _known(distances, range_sigma), design, progress)
     for line in match.rejected:
         click.echo(f"left out: {line}")

@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -64,6 +64,11 @@ def progress_bar(title: str) -> Iterator[Progress]:
             yield report
     finally:
         ended.set()
+
+
+def of_total(report: Progress) -> Callable[[int, int], None]:
+    """Return what reports how many are done, given their number and that of all."""
+    return lambda done, total: report(done / max(total, 1), "")
 
 
 def warn(text: str) -> None:

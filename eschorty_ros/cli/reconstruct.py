@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.cluster import on_cluster
-from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
+from eschorty_ros.cli.console import accuracy_rows, of_total, pairs, progress_bar, warn
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
@@ -127,26 +127,7 @@ def command(
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
       eschorty reconstruct monday/* --dask tcp://host:8786
     """  # noqa: D301
-    from eschorty_ros.core.storage import RAW_ALONE, is_cloud
-    from eschorty_ros.live.bag_files import is_bag
-
-    several = len(recordings) > 1
-    if several and out is not None:
-        raise click.BadParameter(f"one file for {len(recordings)} recordings", param_hint="--out")
-    for recording in recordings:
-        bag = is_bag(recording)
-        if recording.is_file() and not bag:
-            raise click.BadParameter(
-                f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
-            )
-        if not bag:
-            refuse_given(["packet_period"], f"is for a bag; {recording} is none")
-    targets = [out or _target(recording) for recording in recordings]
-    if several and len(set(targets)) < len(targets):
-        twice = next(target for target in targets if targets.count(target) > 1)
-        raise click.UsageError(f"two recordings would be written to {twice}; give them one by one")
-    if not is_cloud(targets[0]):
-        raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
+    calls = _calls(recordings, out)
     task = partial(
         reconstruct_to,
         jobs=jobs,
@@ -156,28 +137,61 @@ def command(
         packet_period_ms=packet_period,
         show=dask is None,
     )
-    calls = list(zip(recordings, targets, strict=True))
+    several = len(calls) > 1
     failed: dict[Path, Exception] = {}
     for index, done in _here(task, calls) if dask is None else on_cluster(dask, task, calls):
-        recording, target = calls[index]
-        error = done if isinstance(done, Exception) else None
-        if error is None:
-            facts, measured = done
-            _print(facts, measured, target, recording if several else None, as_json)
-            if not facts["points"]:
-                error = EschortyError(f"{recording} gives no points; {target} is not written")
-        elif as_json and several:
-            click.echo(json.dumps({"recording": str(recording), "error": str(error)}))
+        error = _printed(done, *calls[index], several, as_json)
         if error is not None:
-            failed[recording] = error
-            if several:
-                click.echo(f"eschorty: {recording}: {error or type(error).__name__}", err=True)
+            failed[recordings[index]] = error
     if failed and not several:
         raise failed[recordings[0]]
     if failed:
         raise EschortyError(
             f"{len(failed)} of {len(recordings)} recordings failed; see the lines above"
         )
+
+
+def _calls(recordings: tuple[Path, ...], out: Path | None) -> list[tuple[Path, Path]]:
+    """Return each recording with its cloud; refuse those that cannot be as wrong usage."""
+    from eschorty_ros.core.storage import RAW_ALONE, is_cloud
+    from eschorty_ros.live.bag_files import is_bag
+
+    if len(recordings) > 1 and out is not None:
+        raise click.BadParameter(f"one file for {len(recordings)} recordings", param_hint="--out")
+    for recording in recordings:
+        if is_bag(recording):
+            continue
+        if recording.is_file():
+            raise click.BadParameter(
+                f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
+            )
+        refuse_given(["packet_period"], f"is for a bag; {recording} is none")
+    if out is not None and not is_cloud(out):
+        raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
+    targets = [out or _target(recording) for recording in recordings]
+    for target in targets:
+        if targets.count(target) > 1:
+            raise click.UsageError(
+                f"two recordings would be written to {target}; give them one by one"
+            )
+    return list(zip(recordings, targets, strict=True))
+
+
+def _printed(
+    done: Any, recording: Path, target: Path, several: bool, as_json: bool
+) -> Exception | None:
+    """Print what a recording gave; return its error, printed, too, where there are several."""
+    error = done if isinstance(done, Exception) else None
+    if error is None:
+        facts, measured = done
+        _print(facts, measured, target, recording if several else None, as_json)
+        if not facts["points"]:
+            error = EschortyError(f"{recording} gives no points; {target} is not written")
+    elif as_json and several:
+        click.echo(json.dumps({"recording": str(recording), "error": str(error)}))
+    if error is not None and several:
+        click.echo(f"eschorty: {recording}: {error or type(error).__name__}", err=True)
+    return error
 
 
 def _target(recording: Path) -> Path:
@@ -252,9 +266,7 @@ def _reconstruct(
     with _progress("reconstructing", show) as report, folder_beside(target) as folder:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
-        result = reconstruct_recording(
-            loaded, chosen, lambda done, total: report(done / max(total, 1), ""), jobs, folder
-        )
+        result = reconstruct_recording(loaded, chosen, of_total(report), jobs, folder)
         report(1.0, "scoring and writing")
         measured = measure_recorded(result.points, result.profiles, loaded)
         if len(result.points):
