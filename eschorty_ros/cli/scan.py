@@ -18,6 +18,7 @@ from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
 if TYPE_CHECKING:
+    from eschorty_ros.nodes.one_process.composition import Tables
     from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
     from eschorty_ros.report.accuracy import KnownScene, Sweep
 
@@ -116,11 +117,7 @@ def command(
     one_scan = nodes_module("one_process.scan", make="scan")
     tables = None
     if hardware is not None:
-        tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
-        values = {"calibration": calibration, "keep": keep}
-        given = {name: values[name] for name in stated(values)}
-        values |= tables.get("reconstruction", {}) | given
-        calibration, keep = values["calibration"], values["keep"]
+        tables, calibration, keep = _hardware(hardware, calibration, keep)
     _check(scene, calibration, effects)
     job = one_scan.ScanJob(
         scene=scene,
@@ -155,6 +152,15 @@ def command(
     if live:
         # The browser comes back to the same address by itself.
         serve_cloud(result.points, host, port)
+
+
+def _hardware(file: Path, calibration: str, keep: str) -> tuple[Tables, str, str]:
+    """Return the nodes' parameters, and calibration and ``keep``: as given, else the file's."""
+    tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(file)
+    values = {"calibration": calibration, "keep": keep}
+    given = {name: values[name] for name in stated(values)}
+    values |= tables.get("reconstruction", {}) | given
+    return tables, values["calibration"], values["keep"]
 
 
 @contextlib.contextmanager
