@@ -80,7 +80,7 @@ class LaserInterlock:
 
     @property
     def armed(self) -> bool:
-        """Armed and not expired, or on."""
+        """Return whether it is on, or armed and the arming has not expired."""
         armed_s = self._armed_s
         return self._on_s is not None or (
             armed_s is not None and self._now_s() - armed_s <= self._arm_timeout_s
@@ -88,7 +88,7 @@ class LaserInterlock:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Heartbeat topics that must be fresh."""
+        """Return the heartbeat topics that must be fresh."""
         return tuple(self._timeouts_s)
 
     def arm(self) -> None:

@@ -43,7 +43,7 @@ class LaserRecord:
 
     @property
     def status(self) -> LaserStatus | None:
-        """The last read-back, ``None`` before the first."""
+        """Return request, read-back and reason, ``None`` before the first read-back."""
         readback = self.readback
         if readback is None:
             return None

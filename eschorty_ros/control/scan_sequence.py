@@ -172,7 +172,7 @@ class Instrument(Protocol):
         """Switch the check of light and events, which raises ``ScanFailure`` at a tick."""
 
     def shield(self) -> None:
-        """From here on no tick raises ``ScanCanceled``."""
+        """Raise no ``ScanCanceled`` from here on."""
 
     def drain(self, no_progress_s: float, within_s: float) -> None:
         """Wait until the reconstruction has passed the present time.

@@ -57,22 +57,22 @@ class Memory:
 
     @property
     def speed_mm_s(self) -> float:
-        """Speed of moves."""
+        """Return the speed of moves."""
         return self._values["velocity"]["velocity"] / self._scale.velocity_unit
 
     @property
     def acceleration_mm_s2(self) -> float:
-        """Acceleration of moves, of homing, and of profiled stops."""
+        """Return the acceleration of moves, of homing, and of profiled stops."""
         return self._values["velocity"]["acceleration"] / self._scale.acceleration_unit
 
     @property
     def homing_mm_s(self) -> float:
-        """Speed of homing."""
+        """Return the speed of homing."""
         return self._values["home"]["velocity"] / self._scale.velocity_unit
 
     @property
     def position_mode(self) -> int:
-        """Mode of the output that gives pulses at positions, 0 without one."""
+        """Return the mode of the output that gives pulses at positions, 0 without one."""
         if self._rack:
             wired = self._values.get("rack_port", {}).get("mode") == 1
             armed = self._values.get("rack_trigger_state", {}).get("state") == 1
@@ -83,7 +83,7 @@ class Memory:
 
     @property
     def sequence(self) -> PulseSequence | None:
-        """Pulses as ports and trigger are set, ``None`` without an output that gives them."""
+        """Return the pulses as they are set, ``None`` without an output that gives them."""
         mode = self.position_mode
         if not mode:
             return None

@@ -44,7 +44,7 @@ class ChannelState:
 
     @property
     def idle_v(self) -> float:
-        """Level between bursts: that of the phase at which a burst starts."""
+        """Return the level between bursts: that of the phase at which a burst starts."""
         turn = self.burst_phase_deg / 360.0 % 1.0
         if self.wave == "SINE":
             share = 0.5 + 0.5 * math.sin(2.0 * math.pi * turn)

@@ -190,7 +190,7 @@ class LinearStage(Protocol):
         """Start an absolute move; raises ``DeviceError`` outside travel, too fast or not homed."""
 
     def stop(self) -> None:
-        """Profiled stop; idempotent."""
+        """Begin a profiled stop; idempotent."""
 
     def state(self, t_ns: int | None = None) -> StageState:
         """Return position, velocity, time and flags, by default at the newest time known.

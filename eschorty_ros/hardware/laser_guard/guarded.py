@@ -105,7 +105,7 @@ class GuardedLaser:
 
     @property
     def guard_pid(self) -> int:
-        """Process id of the guard, 0 when its service has started it."""
+        """Return the process id of the guard, 0 when its service has started it."""
         return self._guard.pid
 
     def configure(self, modulation: Modulation) -> None:

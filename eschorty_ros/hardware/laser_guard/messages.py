@@ -29,7 +29,7 @@ class Wire:
         self._end = end
 
     def fileno(self) -> int:
-        """File descriptor, for polling."""
+        """Return the file descriptor, for polling."""
         return self._end.fileno()
 
     def send(self, message: Mapping[str, Any]) -> None:

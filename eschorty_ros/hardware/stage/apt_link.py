@@ -30,7 +30,7 @@ class SerialPort(Protocol):
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read at once."""
+        """Return the number of bytes that can be read at once."""
 
     def read(self, size: int = 1) -> bytes:
         """Return up to ``size`` bytes within ``timeout``."""

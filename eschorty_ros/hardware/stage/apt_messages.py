@@ -46,7 +46,7 @@ class Layout:
 
     @property
     def payload_bytes(self) -> int:
-        """Length of the payload, 0 for a short message."""
+        """Return the length of the payload, 0 for a short message."""
         return struct.calcsize("<" + self.payload)
 
     def fits(self, payload_bytes: int) -> bool:
@@ -300,10 +300,10 @@ class Scale:
 
     @property
     def velocity_unit(self) -> float:
-        """Counts of 1 mm/s in a velocity parameter."""
+        """Return the counts of 1 mm/s in a velocity parameter."""
         return self.counts_per_mm * self.cycle_s * 65536.0
 
     @property
     def acceleration_unit(self) -> float:
-        """Counts of 1 mm/s2 in an acceleration parameter."""
+        """Return the counts of 1 mm/s2 in an acceleration parameter."""
         return self.counts_per_mm * self.cycle_s**2 * 65536.0

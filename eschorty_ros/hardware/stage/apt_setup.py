@@ -69,7 +69,7 @@ class AptSettings:
 
     @property
     def address(self) -> int:
-        """Address of motion commands."""
+        """Return the address of motion commands."""
         return apt.SINGLE_UNIT if self.controller == "kbd101" else apt.bay_address(self.bay)
 
 

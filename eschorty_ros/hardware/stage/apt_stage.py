@@ -168,7 +168,7 @@ class AptStage:
             )
 
     def stop(self) -> None:
-        """Profiled stop; idempotent, and on the wire at once."""
+        """Begin a profiled stop; idempotent, and on the wire at once."""
         orders = self._orders
         self._stops += 1
         self._send_stop()

@@ -44,12 +44,12 @@ class Status:
 
     @property
     def not_before_ns(self) -> int:
-        """Earliest time at which it can have been taken, also when its request is unknown."""
+        """Return the earliest time it can have been taken at, its request known or not."""
         return self.latest_ns - LATE_NS if self.earliest_ns is None else self.earliest_ns
 
     @property
     def critical(self) -> int:
-        """Bits that must not change by themselves."""
+        """Return the bits that must not change by themselves."""
         return self.bits & _CRITICAL
 
 

@@ -59,7 +59,7 @@ class Actions(Protocol):
         """Request another status message."""
 
     def stop(self) -> None:
-        """Profiled stop."""
+        """Begin a profiled stop."""
 
     def fail(self, error: DeviceError, escalate: bool = False) -> None:
         """Stop for good; ``escalate`` when the carriage may not obey."""
@@ -105,7 +105,7 @@ class Tracker:
 
     @property
     def age_ns(self) -> int:
-        """Time since the last status message; 0 before the first."""
+        """Return the time since the last status message, 0 before the first."""
         return 0 if self._status_ns is None else self._now_ns() - self._status_ns
 
     @property
@@ -339,7 +339,7 @@ class Motion:
 
     @property
     def sense(self) -> int:
-        """Sign of its direction."""
+        """Return the sign of its direction."""
         return (self.target_mm > self.start_mm) - (self.target_mm < self.start_mm)
 
     def stop(self) -> None:

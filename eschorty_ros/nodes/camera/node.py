@@ -121,7 +121,7 @@ class CameraNode(DeviceNode):
         self._write_parameters()
 
     def start_device(self) -> None:
-        """Stream."""
+        """Start to stream."""
         source = self._source
         if source is None:
             raise DeviceError("camera refused: not open; configure it first")

@@ -49,7 +49,7 @@ class SecondNodes:
             mark.set("runs")
 
     def look(self) -> None:
-        """Look if it is time to.
+        """Look for other nodes of these names when that is due.
 
         Raises ``DeviceError`` when another node of a name runs, or has begun to start earlier.
         """

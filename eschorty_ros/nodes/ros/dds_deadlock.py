@@ -34,7 +34,7 @@ class DdsDeadlock:
         self._looks = 0
 
     def look(self) -> None:
-        """Look if it is time to.
+        """Look at sockets and threads when that is due.
 
         Raises ``DdsDeadlockError`` after 5 looks in a row that found the threads blocked. Looks
         count, not time: a process that was stopped finds messages, too, when it continues.

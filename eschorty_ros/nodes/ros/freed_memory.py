@@ -29,7 +29,7 @@ class FreedMemory:
             library.mallopt(_M_TRIM_THRESHOLD, _TRIM_BYTES)
 
     def trim(self) -> None:
-        """Give it back if it is time to."""
+        """Give it back when that is due."""
         now_s = time.monotonic()
         if self._trim is not None and now_s - self._trimmed_s >= _PERIOD_S:
             self._trimmed_s = now_s

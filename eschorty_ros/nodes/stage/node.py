@@ -118,7 +118,7 @@ class StageNode(DeviceNode):
             time.sleep(_POLL_S)
 
     def stop_device(self) -> None:
-        """Profiled stop."""
+        """Begin a profiled stop."""
         with self._lock:
             if self._stage is not None:
                 self._stage.stop()
