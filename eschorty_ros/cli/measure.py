@@ -15,7 +15,7 @@ from eschorty_ros.cli.options import Number
 from eschorty_ros.surfaces.plane import COMMON_SHARE
 
 if TYPE_CHECKING:
-    from eschorty_ros.surfaces.measure import Measured, Pair, Surface
+    from eschorty_ros.surfaces.measure import Measured, Surface
     from eschorty_ros.surfaces.plane import Value
 
 
@@ -88,7 +88,7 @@ def _facts(measured: Measured) -> dict[str, Any]:
         {
             "points": len(surface.part.line),
             "left_out": int((~surface.plane.kept).sum()),
-            "columns": [int(edge) + measured.grid.first_column for edge in _ends(surface, 1)],
+            "columns": _columns(surface, measured.grid.first_column),
             "range_mm": surface.range_mm._asdict(),
             "slope_sweep": surface.plane.slope(0)._asdict(),
             "slope_column": surface.plane.slope(1)._asdict(),
@@ -114,9 +114,10 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _ends(surface: Surface, axis: int) -> tuple[int, int]:
-    numbers = surface.part[axis]
-    return int(numbers.min()), int(numbers.max())
+def _columns(surface: Surface, first: int) -> list[int]:
+    """Return the first and the last column of a surface on a grid that begins at ``first``."""
+    numbers = surface.part.column
+    return [int(numbers.min()) + first, int(numbers.max()) + first]
 
 
 def _text(value: Value) -> str:
@@ -150,9 +151,5 @@ def _print(measured: Measured, title: str) -> None:
     if measured.pairs:
         second = table("", "to surface 1", "distance mm", "angle °", "flush mm", "gap mm")
         for number, pair in enumerate(measured.pairs, 2):
-            second.add_row(str(number), *_pair_texts(pair))
+            second.add_row(str(number), *(_text(value) for value in pair))
         show(second)
-
-
-def _pair_texts(pair: Pair) -> list[str]:
-    return [_text(value) for value in pair]

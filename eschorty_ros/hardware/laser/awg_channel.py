@@ -127,7 +127,7 @@ class AwgChannel:
                 f"{NAME}: it is {reply[:60]!r}, but the profile is {self._profile.name}; "
                 "check every setting on its display"
             )
-        for error in self._scpi.drain_errors() or ():
+        for error in self._scpi.drain_errors():
             self._warn(f"{NAME}: its error queue held {error[:60]!r}")
         parts = [part.strip() for part in reply.split(",")] + [""] * 4
         return DeviceIdentity(

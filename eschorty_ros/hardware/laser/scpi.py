@@ -64,14 +64,14 @@ class Scpi:
         """Return the message of one command."""
         return (text + self._profile.terminator).encode("ascii")
 
-    def drain_errors(self) -> list[str] | None:
-        """Empty the error queue and return its entries, ``None`` when the generator has none.
+    def drain_errors(self) -> list[str]:
+        """Empty the error queue and return its entries, none when the generator has no queue.
 
         At most 32, without a retry: no reply or garbage mean that there is no queue, not a fault.
         """
         query = self._profile.error_queue
         if query is None:
-            return None
+            return []
         found: list[str] = []
         for _ in range(_ERRORS_DRAINED):
             self._refuse_void()
@@ -83,10 +83,10 @@ class Scpi:
                 # If it fails, so does the next command, which clears it once more.
                 with suppress(DeviceError):
                     self._link.clear()
-                return None
+                return []
             match = re.match(r"\s*([-+]?\d+)\s*(,.*)?$", reply)
             if match is None:
-                return None
+                return []
             if int(match[1]) == 0:
                 break
             found.append(reply)

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.base.numbers import number
 from eschorty_ros.emulation.bench.folder import usb_spec
-from eschorty_ros.hardware.base.protocols import EventSource, LaserOutput
+from eschorty_ros.hardware.base.protocols import DeviceIdentity, EventSource, LaserOutput
 from eschorty_ros.hardware.camera import BIASES, save_bias_file
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 from eschorty_ros.msg import LaserState
@@ -245,10 +245,11 @@ class CameraNode(DeviceNode):
 
     def _report(self) -> diagnostics.Report:
         source, packets = self._source, self._packets
+        identity = source.identity if source is not None else DeviceIdentity("", "")
         values: dict[str, Any] = {
-            "device": source.identity.model if source is not None else "",
-            "serial": source.identity.serial if source is not None else "",
-            "firmware": source.identity.firmware if source is not None else "",
+            "device": identity.model,
+            "serial": identity.serial,
+            "firmware": identity.firmware,
             "state": self.state_label,
             "seq": packets.seq,
             "packets_per_s": self._rates["packets"].read(packets.packets),

@@ -204,7 +204,7 @@ class ScannerNode(Node):
             feedback = Scan.Feedback(phase=phase, progress=share)
             feedback.position = m_from_mm(monitor.position_mm)
             feedback.waits_for = self._client.waits_for
-            state = self._client.monitor.reconstruction
+            state = monitor.reconstruction
             if state is not None:
                 feedback.points, feedback.profiles = progress.counts(
                     reconstructed_mm, state.points, state.profiles
