@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 from awg_bench import AwgBench
-from output_log import read_output_log
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.base.files import config_folders
@@ -63,7 +62,7 @@ def test_light_ends_by_itself_after_one_grant(bench: AwgBench, modulation: Modul
     # The output is still on; the level between bursts is dark.
     assert not passes(bench, GRANT_NS - least_ns + 1)
     assert bench.model.output
-    assert [state for _, state in read_output_log(bench.model._log_path)] == ["OFF", "ON", "OFF"]
+    assert bench.outputs() == ["OFF", "ON", "OFF"]
 
 
 def test_renewed_light_goes_on_with_its_phase_and_a_late_renewal_is_a_pause(
