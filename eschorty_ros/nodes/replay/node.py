@@ -30,7 +30,7 @@ from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.live.recorded_packets import TimedPacket, timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.nodes.ros.conversions import m_from_mm, odometry, stamp_from_ns
 from eschorty_ros.nodes.ros.frames import FRAME_PREFIX, frames
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
@@ -306,13 +306,8 @@ class ReplayNode(Node):
         rows = self._recording.stage_samples
         while self._next_row < len(rows):
             t_us = int(rows["t_us"][self._next_row])
-            message = Odometry(child_frame_id=self._frames.stage)
-            message.header.frame_id = self._frames.base
-            message.header.stamp = stamp_from_ns(self._ns(t_us))
             position_mm = float(rows["position_mm"][self._next_row])
-            message.pose.pose.position.y = m_from_mm(position_mm)
-            message.pose.pose.orientation.w = 1.0
-            self._odom.publish(message)
+            self._odom.publish(odometry(self._frames, self._ns(t_us), position_mm))
             self._next_row += 1
             if t_us >= until_us:
                 break

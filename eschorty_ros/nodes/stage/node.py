@@ -22,7 +22,7 @@ from eschorty_ros.emulation.bench.folder import stage_port
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger, StageLimits
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
-from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, odometry, stamp_from_ns
 from eschorty_ros.nodes.ros.frames import FRAME_PREFIX, frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
@@ -282,11 +282,7 @@ class StageNode(DeviceNode):
         return message
 
     def _odometry(self, state: StageState) -> Odometry:
-        message = Odometry(child_frame_id=self._frames.stage)
-        message.header.frame_id = self._frames.base
-        message.header.stamp = stamp_from_ns(state.t_ns)
-        message.pose.pose.position.y = m_from_mm(state.position_mm)
-        message.pose.pose.orientation.w = 1.0
+        message = odometry(self._frames, state.t_ns, state.position_mm)
         message.twist.twist.linear.y = m_from_mm(state.velocity_mm_s)
         message.pose.covariance[7] = self.parameters["position_sigma"] ** 2
         message.twist.covariance[7] = self.parameters["velocity_sigma"] ** 2
