@@ -321,15 +321,11 @@ class Physics:
 
     def _received(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
         """Return the edges without those that the camera misses."""
-        received = [
-            edge for edge in edges if self._chance_of_edge() >= self._imperfections.missing_edges
-        ]
+        missing = self._imperfections.missing_edges
+        received = [edge for edge in edges if self._edge_chance.random() >= missing]
         self.edges += len(edges)
         self.edges_missed += len(edges) - len(received)
         return received
-
-    def _chance_of_edge(self) -> float:
-        return self._edge_chance.random() if self._imperfections.missing_edges else 1.0
 
     def _from_us(self, world: World, t_ns: int) -> int:
         """Return the sensor time of ``t_ns``, not before the world's; counts late changes."""

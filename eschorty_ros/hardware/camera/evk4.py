@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import usb.backend
 
@@ -172,7 +173,7 @@ class Evk4:
                 try:
                     session.stop_sensor()
                 finally:
-                    session.stop_reads()
+                    session.reader.stop()
         if thread.is_alive():
             # A second thread would share its reads.
             self._hung = thread
@@ -198,7 +199,8 @@ class Evk4:
         Raises ``ArgumentError`` for an unknown bias or an offset outside its range. Raises
         ``DeviceError`` when the camera is not open or reads back another value.
         """
-        settings = self._connection.settings.with_bias(name, offset)
+        settings = self._connection.settings
+        settings = replace(settings, biases={**settings.biases, name: offset})
         kept = self._connection.require(name).set_bias(name, offset)
         self._connection.settings = settings
         return kept
@@ -209,7 +211,7 @@ class Evk4:
         Raises ``DeviceError`` when the camera is not open or does not answer.
         """
         self._connection.require("roi").set_windows(windows)
-        self._connection.settings = self._connection.settings.with_windows(windows)
+        self._connection.settings = replace(self._connection.settings, windows=tuple(windows))
 
     def filters_out(self, frequency_hz: float) -> bool:
         """Return whether the anti-flicker filter removes light modulated at ``frequency_hz``."""

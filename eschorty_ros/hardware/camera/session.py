@@ -87,10 +87,6 @@ class Session:
                 self.streaming = False
                 run_sequence(self.control, imx636.STOP, self._settle)
 
-    def stop_reads(self) -> None:
-        """Stop the reads, after the last ``reader.read``; idempotent."""
-        self.reader.stop()
-
     def is_streaming(self) -> bool:
         """Return whether the sensor's time base runs."""
         return imx636.is_streaming(self.control)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
 from eschorty_ros.hardware.camera.biases import BiasBank, check_offset
@@ -44,14 +44,6 @@ class CameraSettings:
     def __post_init__(self) -> None:
         for name, offset in self.biases.items():
             check_offset(name, offset, self.wide_biases)
-
-    def with_bias(self, name: str, offset: int) -> CameraSettings:
-        """Return these settings with one bias changed."""
-        return replace(self, biases={**self.biases, name: offset})
-
-    def with_windows(self, windows: Sequence[Window]) -> CameraSettings:
-        """Return these settings with other regions of interest."""
-        return replace(self, windows=tuple(windows))
 
 
 def apply_settings(
