@@ -23,7 +23,6 @@ class ChannelState:
     """Settings of one output, as after power-up."""
 
     output: bool = False
-    sync: bool = False
     wave: str = "SINE"
     mode: str = "CONTINUE"
     burst_type: str = "NCYC"
@@ -34,7 +33,6 @@ class ChannelState:
     high_v: float = 0.05
     low_v: float = -0.05
     duty_percent: float = 50.0
-    phase_deg: float = 0.0
     amplitude_unit: str = "VPP"
     load_ohm: float = HIGH_Z_OHM
     inversion: bool = False
@@ -169,14 +167,12 @@ def _put_load(state: ChannelState, text: str) -> None:
 
 CHANNEL_COMMANDS = (
     _switch("OUTPut", "output"),
-    _switch("OUTPut:SYNC", "sync"),
     _word("BASE:WAVe", "wave", WAVES),
     _word("MODe", "mode", MODES),
     _command("BASE:FREQuency", _put_frequency, lambda state: _plain(state.frequency_hz, 6)),
     _level("BASE:HIGH", "high_v"),
     _level("BASE:LOW", "low_v"),
     _value("BASE:DUTY", "duty_percent", 0.1, 99.9, 3),
-    _value("BASE:PHASe", "phase_deg", -360.0, 360.0, 2),
     _word("AMPLitude:UNIT", "amplitude_unit", ("VPP", "VRMS")),
     _command("LOAD", _put_load, lambda state: _plain(state.load_ohm, 0)),
     _word("BURSt:TYPe", "burst_type", ("NCYC", "GATe", "INFinit")),

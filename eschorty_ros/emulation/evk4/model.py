@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from eschorty_ros.emulation.bus import (
     SPEED_SUPER,
@@ -24,12 +24,7 @@ from eschorty_ros.emulation.bus import (
 from eschorty_ros.emulation.evk4.registers import SENSOR_RESET, Registers
 from eschorty_ros.emulation.evk4.sequences import Phase, SequenceWatch
 from eschorty_ros.emulation.evk4.settings import SETTING_ADDRESSES, SensorSettings, read_settings
-from eschorty_ros.emulation.evk4.stream import (
-    PixelMask,
-    SensorSource,
-    dropped,
-    without_triggers,
-)
+from eschorty_ros.emulation.evk4.stream import PixelMask, SensorSource, without_triggers
 from eschorty_ros.emulation.evk4.treuzell import BoardIdentity, TreuzellBoard
 
 CONTROL_OUT, CONTROL_IN, DATA_IN = 0x02, 0x82, 0x81
@@ -41,16 +36,12 @@ class Evk4Model(EmulatedUsbDevice):
     """EVK4 with an IMX636.
 
     - ``source``: Returns the pixels' words while the sensor streams; read only when the host reads.
-    - ``factory_dacs``: The camera's bias trim by name.
     - ``clock_ns``: With a clock the waits of the register sequences are checked, too.
     - ``wait``: As for ``EmulatedUsbDevice``.
 
     Public attributes:
     - ``watch``: Phase and violations.
     - ``board``: Answers requests.
-    - ``buffer_bytes``: Size of the device's buffer. None: nothing is lost however late the host
-      reads. Otherwise words since the last read that do not fit are dropped, with the sensor's
-      mark.
     - ``configure``: Called with ``SensorSettings`` after a write that changes them.
     - ``lateness_ns``: Returns ``late_ns`` of the words that the source has returned.
     """
@@ -60,7 +51,6 @@ class Evk4Model(EmulatedUsbDevice):
         source: SensorSource,
         *,
         board: BoardIdentity | None = None,
-        factory_dacs: Mapping[str, int] | None = None,
         clock_ns: Callable[[], int] | None = None,
         wait: Wait = threading.Condition.wait,
     ):
@@ -84,9 +74,8 @@ class Evk4Model(EmulatedUsbDevice):
             ),
             wait=wait,
         )
-        self.registers = Registers(factory_dacs)
+        self.registers = Registers()
         self.watch = SequenceWatch(clock_ns)
-        self.buffer_bytes: int | None = None
         self.configure: Callable[[SensorSettings], None] | None = None
         self.lateness_ns: Callable[[], int] | None = None
         self._source = source
@@ -168,25 +157,12 @@ class Evk4Model(EmulatedUsbDevice):
     def _pull(self, timeout_s: float) -> None:
         """Move words from the source to the endpoint until some have come or time is up."""
         run, until_s = self._run, time.monotonic() + timeout_s
-        if self.buffer_bytes is not None:
-            self._overflow(run)
         while not self.pending(DATA_IN):
             data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
             if self.lateness_ns is not None:
                 self.late_ns = self.lateness_ns()
             if not self._send_words(data, run):
                 return
-
-    def _overflow(self, run: int) -> None:
-        space, lost = self.buffer_bytes or 0, 0
-        while data := self._source.read(_PULL_BYTES, 0.0):
-            kept = data[: space - space % 2]
-            space -= len(kept)
-            lost += (len(data) - len(kept)) // 2
-            if kept and not self._send_words(kept, run):
-                return
-        if lost:
-            self._send_words(dropped(lost), run)
 
     def _send_words(self, data: bytes, run: int) -> bool:
         """Queue words; False without any or after the end of their stream."""

@@ -6,10 +6,8 @@ drivers rely on; the rest reads 0. *Unconfirmed on hardware.*
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 _CHIP_ID = 0xA0401806
-_FACTORY_DACS = {
+FACTORY_DACS = {
     "bias_fo": 0x53,
     "bias_hpf": 0x00,
     "bias_diff_on": 0x66,
@@ -17,6 +15,7 @@ _FACTORY_DACS = {
     "bias_diff_off": 0x49,
     "bias_refr": 0x14,
 }
+"""A typical trim."""
 BIAS_ADDRESSES = {
     "bias_fo": 0x1004,
     "bias_hpf": 0x100C,
@@ -52,14 +51,11 @@ SENSOR_RESET = 0x400004
 class Registers:
     """Addresses (multiples of 4) to 32-bit values.
 
-    - ``factory_dacs``: The camera's trim, DAC value by bias name; the default is a typical one.
-
     Public attributes:
     - ``temperature_c``: Temperature that the sensor reports.
     """
 
-    def __init__(self, factory_dacs: Mapping[str, int] | None):
-        self.factory_dacs = {**_FACTORY_DACS, **(factory_dacs or {})}
+    def __init__(self) -> None:
         self.temperature_c = 35.0
         self._values: dict[int, int] = {}
         self._temperature_ready = False
@@ -69,7 +65,7 @@ class Registers:
         """Set the values after power-up or a sensor reset."""
         self._values = dict(_RESET)
         for name, address in BIAS_ADDRESSES.items():
-            self._values[address] = _BIAS_WORD | self.factory_dacs[name]
+            self._values[address] = _BIAS_WORD | FACTORY_DACS[name]
 
     def __getitem__(self, address: int) -> int:
         return self._values.get(address, 0)

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from eschorty_ros.emulation.evk4.registers import BIAS_ADDRESSES, SENSOR_RESET, Registers
+from eschorty_ros.emulation.evk4.registers import (
+    BIAS_ADDRESSES,
+    FACTORY_DACS,
+    SENSOR_RESET,
+    Registers,
+)
 
 _CONTROL, _MASKS_ON = 0x0004, 1 << 1
 _COLUMN_MASKS = range(0x2000, 0x20A0, 4)
@@ -54,7 +59,7 @@ def read_settings(registers: Registers) -> SensorSettings:
     """Return the settings in the registers."""
     return SensorSettings(
         biases=tuple(
-            (name, (registers[address] & 0xFF) - registers.factory_dacs[name])
+            (name, (registers[address] & 0xFF) - FACTORY_DACS[name])
             for name, address in BIAS_ADDRESSES.items()
         ),
         columns_off=_lines(registers, _COLUMN_MASKS),

@@ -107,15 +107,3 @@ def without_triggers(data: bytes) -> bytes:
     """Return the words without trigger words."""
     words = np.frombuffer(data, np.dtype("<u2"))
     return words[words >> 12 != w3.EXT_TRIGGER].tobytes()
-
-
-def dropped(words: int) -> bytes:
-    """Return the sensor's mark for that many dropped words."""
-    count = min(words, (1 << 28) - 1)
-    mark = (
-        w3.OTHERS << 12 | w3.DROPPED_EVENTS,
-        w3.CONTINUED_12 << 12 | count & 0xFFF,
-        w3.CONTINUED_12 << 12 | count >> 12 & 0xFFF,
-        w3.CONTINUED_4 << 12 | count >> 24,
-    )
-    return np.array(mark, np.dtype("<u2")).tobytes()

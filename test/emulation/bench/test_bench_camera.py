@@ -9,6 +9,7 @@ from evk4_bench import OnDemand
 
 from eschorty_ros.emulation.bench.devices import sensor_control
 from eschorty_ros.emulation.evk4 import Evk4Model
+from eschorty_ros.emulation.evk4.registers import FACTORY_DACS
 from eschorty_ros.hardware.camera import BIASES, CameraSettings
 from eschorty_ros.simulation.pixels import Biases
 from eschorty_ros.simulation.world import SensorControl
@@ -89,7 +90,7 @@ def test_offsets_beyond_the_normal_range_act_as_its_end() -> None:
     model = Evk4Model(OnDemand())
     model.configure = lambda settings: seen.append(sensor_control(settings))
     fo = BIASES["bias_fo"]
-    model.write(fo.address, 0x11A10000 | model.registers.factory_dacs["bias_fo"] + 90)
+    model.write(fo.address, 0x11A10000 | FACTORY_DACS["bias_fo"] + 90)
     assert seen[-1] == SensorControl(Biases(fo=fo.normal[1]))
     model.power_up()
     assert seen[-1] == SensorControl()
