@@ -3,7 +3,6 @@
 from eschorty_ros.emulation.bus.pty_port import PtyPort
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
 from eschorty_ros.emulation.bus.usb_device import (
-    SPEED_HIGH,
     SPEED_SUPER,
     EmulatedUsbDevice,
     EndpointIdentity,
@@ -14,7 +13,6 @@ from eschorty_ros.emulation.bus.usb_device import (
 from eschorty_ros.emulation.bus.usb_server import UsbServer
 
 __all__ = [
-    "SPEED_HIGH",
     "SPEED_SUPER",
     "EmulatedBackend",
     "EmulatedUsbDevice",
