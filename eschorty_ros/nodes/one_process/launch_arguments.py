@@ -13,7 +13,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from eschorty_ros.control.scan_sequence import ScanRequest, check_request
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.base.files import config_path
-from eschorty_ros.core.calibration import read_distances
+from eschorty_ros.core.calibration import METHODS, read_distances
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import load_recording
 from eschorty_ros.nodes.one_process.composition import NAMESPACE, Tables
@@ -23,6 +23,7 @@ from eschorty_ros.nodes.ros.conversions import mm_from_m
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.stage.parameters import stage_limits
+from eschorty_ros.simulation.pixels import PRESETS
 from eschorty_ros.simulation.scenes import named
 
 EVENTS = f"{NAMESPACE}/camera/events"
@@ -51,8 +52,7 @@ _DEVICES = (
     Argument("trigger", "stage",
              "what is wired to the camera's trigger input: none, laser or stage",
              ("none", "laser", "stage")),
-    Argument("pixels", "paper", "event pixels of an emulated camera",
-             ("paper", "ideal", "noisy", "narrow")),
+    Argument("pixels", "paper", "event pixels of an emulated camera", tuple(PRESETS)),
     Argument("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
     Argument(
         "frequency",
@@ -88,7 +88,7 @@ CALIBRATE = (
     Argument("as_built", "config_3_as_built", "build of the emulated bench"),
     Argument("distances", "posts", "what is known of the targets: a name in config/ or a CSV file"),
     Argument("method", "joint", "what is fitted: k', b' and more under priors, or k' and b' alone",
-             ("joint", "paper")),
+             METHODS),
     Argument("capture_time", "1.0", "for how long the targets are lit, s"),
     Argument("calibration_folder", "",
              "where calibrations are written; empty: eschorty in ~/.ros"),
