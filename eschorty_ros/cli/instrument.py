@@ -1,4 +1,4 @@
-"""Shared by the commands that run all nodes in this process."""
+"""The modules of the nodes, and an orderly end by signals, for the commands."""
 
 from __future__ import annotations
 

@@ -70,7 +70,8 @@ def command(
     """  # noqa: D301
     if (cloud is None) != live or window + browser + live > 1 or (allow_scan and not live):
         raise click.UsageError(
-            "give CLOUD, with --window or --browser, or --live, with --allow-scan, without it"
+            "give CLOUD, if wanted with --window or --browser; or --live, if wanted with "
+            "--allow-scan, and no CLOUD"
         )
     if not (browser or live):
         refuse_given(("host", "port"), "belongs to --browser or --live")
