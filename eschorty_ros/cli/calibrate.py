@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import of_total, pairs, progress_bar, show, table, warn
-from eschorty_ros.cli.files import OUT_FILE, report_replaced
+from eschorty_ros.cli.files import OUT_FILE, check_output, is_yaml, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import Number, refuse_given
 from eschorty_ros.core.base.errors import FitError
@@ -236,11 +236,9 @@ def _check_sources(sources: tuple[Path, ...], distances: str | None, moving: flo
 
 
 def _check_out(out: Path) -> None:
-    from eschorty_ros.core.base.files import check_writable
-
-    if out.suffix not in (".yaml", ".yml"):
+    if not is_yaml(out):
         raise click.UsageError(f"--out is {out}; give a path ending in .yaml")
-    check_writable(out)
+    check_output(out)
 
 
 def _priors(given: tuple[str, ...]) -> dict[str, float] | None:

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import decimals, show, table
-from eschorty_ros.cli.files import OUT_FILE, check_output, check_picture, report_replaced
+from eschorty_ros.cli.files import (
+    OUT_FILE,
+    check_output,
+    check_picture,
+    is_yaml,
+    report_replaced,
+)
 from eschorty_ros.cli.options import Number, refuse_given
 
 if TYPE_CHECKING:
@@ -99,7 +105,7 @@ def command(
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
     for out in outs:
-        if _is_build(out):
+        if is_yaml(out):
             check_output(out)
         else:
             check_picture(out)
@@ -129,16 +135,12 @@ def command(
     if light:
         click.echo(light)
     for out in outs:
-        if _is_build(out):
+        if is_yaml(out):
             report_replaced(out)
             save_calibration(build.calibration(out.stem), out)
         else:
             _draw(build, np.linspace(near, last, 400), out)
         click.echo(str(out))
-
-
-def _is_build(out: Path) -> bool:
-    return out.suffix in (".yaml", ".yml")
 
 
 def _light(

@@ -23,6 +23,11 @@ def check_output(out: Path, *inputs: Path) -> None:
     check_writable(out)
 
 
+def is_yaml(path: Path) -> bool:
+    """Return whether a file is YAML by its name, such as a calibration."""
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
 def check_picture(out: Path, *inputs: Path) -> None:
     """Refuse a picture that cannot be written, or whose extension names no form of one."""
     from matplotlib.backend_bases import FigureCanvasBase

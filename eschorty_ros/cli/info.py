@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar, warn
+from eschorty_ros.cli.files import is_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +86,7 @@ def command(path: Path) -> None:
         marks = read_marks_csv(path)
         pairs(str(path), {"packets lost": f"{marks['packets_lost'].sum():,}",
                           "laser switched on": f"{marks['laser_on'].sum():,} times"})  # fmt: skip
-    elif path.suffix.lower() in (".yaml", ".yml"):
+    elif is_yaml(path):
         pairs(str(path), _calibration(load_calibration(path)))
     elif path.name == TRUTH_FILE:
         pairs(str(path), _truth(read_truth_csv(path)))
