@@ -6,6 +6,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -28,7 +29,7 @@ from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
-from eschorty_ros.nodes.ros.parameters import Param, from_settings
+from eschorty_ros.nodes.ros.parameters import Param, from_settings, settings_of
 from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
@@ -39,7 +40,6 @@ THREADS = 4
 _COMMANDS_MAX = THREADS - 2
 WATCHED = ("camera", "stage")
 
-DRIVER_TABLE = from_settings(AwgSettings)
 TABLE = (
     *drivers.DRIVER,
     Param(
@@ -64,7 +64,7 @@ TABLE = (
     Param("camera_timeout", 1.0, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
     Param("stage_timeout", 1.0, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
     Param("readback_rate", 5.0, "how often the generator is read back", "Hz", 0.1, 20.0),
-    *DRIVER_TABLE,
+    *from_settings(AwgSettings),
 )
 
 
@@ -323,12 +323,12 @@ class LaserNode(DeviceNode):
 
 
 def _make_laser(parameters: Mapping[str, Any], _: drivers.ClockNs) -> GuardedLaser:
-    settings = {param.name: parameters[param.name] for param in DRIVER_TABLE}
+    settings = settings_of(parameters, AwgSettings)
     # Refused here, before a process is started for it. What the backend imports is loaded then:
     # after the end of the guard there is no time for it.
-    open_backend(AwgSettings(**settings).backend)
+    open_backend(settings.backend)
     return GuardedLaser(
-        "eschorty_ros.hardware.laser.awg:open_laser", settings, guard=parameters["guard"]
+        "eschorty_ros.hardware.laser.awg:open_laser", asdict(settings), guard=parameters["guard"]
     )
 
 

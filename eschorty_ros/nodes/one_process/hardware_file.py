@@ -10,15 +10,14 @@ from typing import Any
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.base.yaml_file import read_yaml
-from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.camera import node as camera
 from eschorty_ros.nodes.laser import node as laser
 from eschorty_ros.nodes.one_process.composition import NAMESPACE
-from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters
+from eschorty_ros.nodes.reconstruction import parameters as reconstruction
 from eschorty_ros.nodes.replay import node as replay
 from eschorty_ros.nodes.ros import lifecycle
 from eschorty_ros.nodes.ros.drivers import REAL
-from eschorty_ros.nodes.ros.parameters import check_name, from_settings, of_ros
+from eschorty_ros.nodes.ros.parameters import check_name, of_ros
 from eschorty_ros.nodes.scanner import node as scanner
 from eschorty_ros.nodes.stage import node as stage
 from eschorty_ros.nodes.viewer import node as viewer
@@ -28,7 +27,7 @@ TABLES = {
     "camera": camera.TABLE,
     "laser": laser.TABLE,
     "stage": stage.TABLE,
-    "reconstruction": (*reconstruction_parameters.TABLE, *from_settings(Settings, dynamic=True)),
+    "reconstruction": reconstruction.TABLE,
     "scanner": scanner.TABLE,
     "replay": replay.TABLE,
     "viewer": viewer.TABLE,

@@ -50,7 +50,7 @@ from eschorty_ros.nodes.ros.conversions import stage_position_mm
 from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.frames import frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
-from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
+from eschorty_ros.nodes.ros.parameters import Parameters, settings_of
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s, publishers_fault
 from eschorty_ros.nodes.ros.spin import run
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
@@ -71,10 +71,7 @@ _COMPILING = "compiling kernels, for some minutes at a first start; 'eschorty co
 
 
 class ReconstructionNode(Node):
-    """Callbacks queue jobs; one worker thread computes and publishes.
-
-    Its parameters are those of ``core.reconstruction.Settings`` and of ``TABLE``.
-    """
+    """Callbacks queue jobs; one worker thread computes and publishes."""
 
     def __init__(self, **kwargs: Any) -> None:
         self._camera, self._laser, self._stage = OnePublisher(), OnePublisher(), OnePublisher()
@@ -82,13 +79,12 @@ class ReconstructionNode(Node):
         self._closing = threading.Event()
         self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
         super().__init__("reconstruction", **kwargs)
-        table = (*TABLE, *from_settings(Settings, dynamic=True))
-        self.parameters = Parameters(self, table, self._on_change)
+        self.parameters = Parameters(self, TABLE, self._on_change)
         self.calibration = load_calibration(self.parameters["calibration"])
         slow = threading.Timer(_COMPILING_S, self.get_logger().info, (_COMPILING,))
         slow.start()
         try:
-            warm_up(self.calibration, self.parameters.settings(Settings))
+            warm_up(self.calibration, settings_of(self.parameters, Settings))
         finally:
             slow.cancel()
         self._override = modulation_override(self.parameters)
@@ -96,7 +92,7 @@ class ReconstructionNode(Node):
         check_record_name(self.parameters["record_name"])
         self._pipeline = Pipeline(
             self.calibration,
-            self.parameters.settings(Settings),
+            settings_of(self.parameters, Settings),
             self.parameters["clock_timeout"],
             self.parameters["stage_gap"],
             self.parameters["stage_timeout"],
@@ -111,7 +107,7 @@ class ReconstructionNode(Node):
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
         self._camera_roi = CameraRoi(self, self.parameters["camera_roi"] == "follow")
-        self._camera_roi.follow(self.parameters.settings(Settings), self.calibration.model())
+        self._camera_roi.follow(settings_of(self.parameters, Settings), self.calibration.model())
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
         self.get_logger().info(self._sources())
@@ -260,7 +256,7 @@ class ReconstructionNode(Node):
         def use() -> None:
             self._pipeline.set_calibration(calibration)
             self.calibration = calibration
-            self._camera_roi.follow(self.parameters.settings(Settings), calibration.model())
+            self._camera_roi.follow(settings_of(self.parameters, Settings), calibration.model())
 
         done, reason = self._in_worker(use)
         if not done:
@@ -304,7 +300,7 @@ class ReconstructionNode(Node):
             passes=passes,
             stage_gap_s=float(values["stage_gap"]),
         )
-        settings = dataclasses.asdict(values.settings(Settings))
+        settings = dataclasses.asdict(settings_of(values, Settings))
         return ScanRecorder(folder, log, self.calibration, settings)
 
     # The worker.
@@ -374,8 +370,7 @@ class ReconstructionNode(Node):
 
     def _on_change(self, values: dict[str, Any]) -> None:
         check_record_name(values["record_name"])
-        names = Settings.__dataclass_fields__
-        settings = Settings(**{name: values[name] for name in names if name in values})
+        settings = settings_of(values, Settings)
         override = modulation_override(values)
         self._camera_roi.follow(settings, self.calibration.model())
         self._post(partial(self._pipeline.stream.set_settings, settings))

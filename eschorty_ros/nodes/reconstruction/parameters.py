@@ -1,4 +1,4 @@
-"""Parameters of the reconstruction node besides ``core.reconstruction.Settings``."""
+"""Parameters of the reconstruction node."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.ros.frames import FRAME_PREFIX
-from eschorty_ros.nodes.ros.parameters import Param
+from eschorty_ros.nodes.ros.parameters import Param, from_settings
 
 TABLE = (
     Param("calibration", "config_3", "calibration: a name in config/ or a file's path"),
@@ -50,6 +51,7 @@ TABLE = (
           "s", 0.1, 60.0),
     Param("publish_tf", True, "publish /tf and /tf_static"),
     FRAME_PREFIX,
+    *from_settings(Settings, dynamic=True),
 )  # fmt: skip
 
 

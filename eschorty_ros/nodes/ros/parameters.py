@@ -7,7 +7,7 @@ import math
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -28,6 +28,7 @@ from eschorty_ros.core.base.numbers import short
 
 _OF_ROS = ("qos_overrides", "start_type_description_service", "use_sim_time")
 
+Settings = TypeVar("Settings")
 Value = bool | int | float | str | tuple[int, ...]
 
 
@@ -111,28 +112,25 @@ def of_ros(name: object) -> bool:
 
 
 def from_settings(settings_class: type[Any], *, dynamic: bool = False) -> tuple[Param, ...]:
-    """Return parameters of a dataclass whose fields carry ``description, unit, range, choices``.
-
-    Fields whose default is not a bool, number or string are left out.
-    """
+    """Return parameters of a dataclass whose fields carry ``description, unit, range, choices``."""
     table = []
     for field in dataclasses.fields(settings_class):
-        if not isinstance(field.default, bool | int | float | str):
-            continue
-        low, high = field.metadata.get("range") or (None, None)
+        default: Any = field.default
+        meta = field.metadata
+        low, high = meta.get("range", (None, None))
+        choices = meta.get("choices", ())
         table.append(
             Param(
-                field.name,
-                field.default,
-                field.metadata.get("description", ""),
-                field.metadata.get("unit", ""),
-                low,
-                high,
-                tuple(field.metadata.get("choices") or ()),
-                dynamic,
+                field.name, default, meta["description"], meta["unit"], low, high, choices, dynamic
             )
         )
     return tuple(table)
+
+
+def settings_of(values: Mapping[str, Any], settings_class: type[Settings]) -> Settings:
+    """Return the dataclass that ``from_settings`` made parameters of, with their values."""
+    names = [param.name for param in from_settings(settings_class)]
+    return settings_class(**{name: values[name] for name in names})
 
 
 class Parameters(Mapping[str, Any]):
@@ -176,11 +174,6 @@ class Parameters(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._table)
-
-    def settings(self, settings_class: type[Any]) -> Any:
-        """Return the dataclass that ``from_settings`` made parameters of, with their values."""
-        names = {field.name for field in dataclasses.fields(settings_class)}
-        return settings_class(**{name: value for name, value in self.items() if name in names})
 
     def _coerce(self, proposed: list[Parameter[Any]]) -> list[Parameter[Any]]:
         return [self._as_declared(parameter) for parameter in proposed]
