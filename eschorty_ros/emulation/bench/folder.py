@@ -11,15 +11,12 @@ STAGE_PORT = "stage"
 READY_FILE = "ready"
 
 
-def default_folder() -> Path:
-    """Return the folder of this user's bench in this ROS domain."""
+def bench_folder(name: str | Path | None) -> Path:
+    """Return the folder ``name``; without one that of this user's bench in this ROS domain."""
+    if name:
+        return Path(name)
     base = os.environ.get("XDG_RUNTIME_DIR") or f"{tempfile.gettempdir()}/eschorty-{os.getuid()}"
     return Path(base) / f"eschorty-bench-{os.environ.get('ROS_DOMAIN_ID') or 0}"
-
-
-def bench_folder(name: str) -> Path:
-    """Return the folder ``name``, or the default one for an empty name."""
-    return Path(name) if name else default_folder()
 
 
 def usb_spec(folder: Path) -> str:

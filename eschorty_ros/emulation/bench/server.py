@@ -19,7 +19,7 @@ from eschorty_ros.emulation.bench.folder import (
     READY_FILE,
     STAGE_PORT,
     USB_SOCKET,
-    default_folder,
+    bench_folder,
     stage_port,
     usb_spec,
 )
@@ -195,7 +195,7 @@ def command(
       eschorty-bench /tmp/bench --sensor-ppm 50 --usb-jitter 3 --missing-edges 0.001
     """  # noqa: D301
     serve(
-        folder or default_folder(),
+        bench_folder(folder),
         BenchSettings(
             scene,
             calibration,

@@ -17,7 +17,6 @@ from eschorty_ros.emulation.bench.folder import (
     STAGE_PORT,
     USB_SOCKET,
     bench_folder,
-    default_folder,
     usb_spec,
 )
 from eschorty_ros.emulation.bench.process import bench_command, bench_process
@@ -107,11 +106,11 @@ def test_refused_options_are_one_line(folder: Path, options: dict[str, str], nam
 def test_the_default_folder_is_the_users_and_the_domains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
     monkeypatch.setenv("ROS_DOMAIN_ID", "12")
-    assert default_folder() == bench_folder("") == Path("/run/user/7/eschorty-bench-12")
+    assert bench_folder(None) == bench_folder("") == Path("/run/user/7/eschorty-bench-12")
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     monkeypatch.delenv("ROS_DOMAIN_ID")
-    assert str(os.getuid()) in str(default_folder())
-    assert default_folder().name == "eschorty-bench-0"
+    assert str(os.getuid()) in str(bench_folder(""))
+    assert bench_folder("").name == "eschorty-bench-0"
     assert bench_folder("/tmp/b") == Path("/tmp/b")
 
 
