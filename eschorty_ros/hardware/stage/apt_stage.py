@@ -116,13 +116,13 @@ class AptStage:
         self._link.wait_until(
             lambda: (
                 self._tracker.failure is not None
-                or (self._tracker.motion is None and self._tracker.has(apt.ENABLED))
+                or (self._tracker.motion is None and self._tracker.enabled)
             ),
             _ENABLE_S,
         )
         if self._tracker.failure is not None:
             raise self._tracker.failure
-        if not self._tracker.has(apt.ENABLED):
+        if not self._tracker.enabled:
             raise DeviceError(
                 "stage: the controller does not enable the axis; check its front panel, the "
                 "interlock and the motor cable"
@@ -240,7 +240,7 @@ class AptStage:
         if tracker.motion is not None:
             raise DeviceError("the stage is moving; stop it or wait before the next move")
         assert tracker.status is not None
-        if not tracker.status.bits & apt.ENABLED:
+        if not tracker.enabled:
             raise DeviceError("the stage is not enabled; check the front panel, configure again")
         return tracker.status
 

@@ -120,9 +120,10 @@ class Tracker:
         """Return whether the axis moves to its reference."""
         return self.motion is not None and self.motion.kind is Kind.HOME
 
-    def has(self, bits: int) -> bool:
-        """Return whether one of the status bits is set."""
-        return self.status is not None and bool(self.status.bits & bits)
+    @property
+    def enabled(self) -> bool:
+        """Return whether the axis is enabled."""
+        return self.status is not None and bool(self.status.bits & apt.ENABLED)
 
     def begin_motion(
         self, kind: Kind, start_mm: float, target_mm: float, speed: float, limit_s: float
