@@ -28,7 +28,7 @@ from eschorty_ros.live.calibration_capture import (
 from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.reconstruction.calibration_messages import fill_result, request_from_goal
 from eschorty_ros.nodes.ros.cloud_messages import image_message
-from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
+from eschorty_ros.nodes.ros.instrument_client import InstrumentClient, end_goal
 from eschorty_ros.nodes.ros.spin import unless_shut_down
 
 _FEEDBACK_S = 0.2
@@ -150,16 +150,13 @@ class Calibrator:
 
     def _closed(self, goal: Any, end: End, result: Any) -> Any:
         result.success = end is End.SUCCEEDED
+        end_goal(goal, end)
         if result.success:
-            goal.succeed()
             self._node.get_logger().info(
                 f"calibrated on {len(result.ranges)} targets, residual {result.residual_rms:.2f} "
                 f"px; {'; '.join(result.verdicts)}"
             )
-        elif end is End.CANCELED and goal.is_cancel_requested:
-            goal.canceled()
-        else:
-            goal.abort()
+        elif end is End.ABORTED:
             self._node.get_logger().error(f"calibration failed: {result.message}")
         return result
 

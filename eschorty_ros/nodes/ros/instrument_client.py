@@ -28,6 +28,7 @@ from eschorty_ros.control.instrument_monitor import (
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import (
+    End,
     ScanFailure,
     ScanRequest,
     ScanSummary,
@@ -375,6 +376,16 @@ class ScanClient(InstrumentClient):
         return ScanSummary(answer.profiles, answer.points, answer.events, answer.packets_lost,
                            answer.events_dropped, answer.sigma_median, answer.message,
                            answer.completeness, answer.recording)  # fmt: skip
+
+
+def end_goal(goal: Any, end: End) -> None:
+    """End the goal of a sequence as the sequence has ended."""
+    if end is End.SUCCEEDED:
+        goal.succeed()
+    elif end is End.CANCELED and goal.is_cancel_requested:
+        goal.canceled()
+    else:
+        goal.abort()
 
 
 class _LifecycleState:

@@ -32,7 +32,7 @@ from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ
 from eschorty_ros.live.sweep_coverage import PASSES_MAX
 from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
-from eschorty_ros.nodes.ros.instrument_client import ScanClient
+from eschorty_ros.nodes.ros.instrument_client import ScanClient, end_goal
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.spin import ends, run, unless_shut_down
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
@@ -163,7 +163,7 @@ class ScannerNode(Node):
         else:
             self.get_logger().info(line)
         with unless_shut_down(self):
-            _close(goal, outcome.end)
+            end_goal(goal, outcome.end)
         return result
 
     def _canceled(self, goal: Any) -> bool:
@@ -271,15 +271,6 @@ class ScannerNode(Node):
         failed = not scanning and End.ABORTED.value in self._last
         level = diagnostics.WARN if failed else diagnostics.OK
         return level, "scanning" if scanning else self._last, values
-
-
-def _close(goal: Any, end: End) -> None:
-    if end is End.SUCCEEDED:
-        goal.succeed()
-    elif end is End.CANCELED and goal.is_cancel_requested:
-        goal.canceled()
-    else:
-        goal.abort()
 
 
 def main() -> int:
