@@ -107,7 +107,7 @@ def command(
     from eschorty_ros.cli.view import serve_cloud
     from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage.recording_writer import make_recording_folder
-    from eschorty_ros.viewer.page import load_viser, open_when_served
+    from eschorty_ros.viewer.page import load_viser, open_when_served, page_url
 
     check_sweep(start, stop)
     if hardware is not None:
@@ -140,7 +140,7 @@ def command(
     if live:
         load_viser()
         open_when_served(host, port)
-        click.echo(f"page at http://{host}:{port}", err=True)
+        click.echo(f"page at {page_url(host, port)}", err=True)
     report_replaced(out / "scan.pcd")
     with _made(out, record), ended_by_signals(), progress_bar("scanning") as feedback:
         out.mkdir(parents=True, exist_ok=True)

@@ -79,7 +79,7 @@ class Page:
         # viser prints lines of its own.
         with contextlib.redirect_stdout(None), _guarded(host):
             self.server = _private(viser)(host=host, port=port, label="eschorty", verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        self.url = page_url(host, self.server.get_port())
         self.server.scene.set_up_direction("+z")
         self._build()
         self.server.on_client_connect(self._connected)
@@ -283,6 +283,12 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def page_url(host: str, port: int) -> str:
+    """Return the address of a page, by this computer's name where it is served on every address."""
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host  # noqa: S104
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
+
+
 def open_when_served(host: str, port: int) -> None:
     """Open the page in the browser of a desktop, if this is one, once its server answers.
 
@@ -297,7 +303,7 @@ def open_when_served(host: str, port: int) -> None:
         while time.monotonic() < end_s:
             with contextlib.suppress(OSError):
                 socket.create_connection((host, port), 1.0).close()
-                webbrowser.open(f"http://{host}:{port}")
+                webbrowser.open(page_url(host, port))
                 return
             time.sleep(_POLL_S)
 
@@ -306,12 +312,12 @@ def open_when_served(host: str, port: int) -> None:
 
 def _check_free(host: str, port: int) -> None:
     """Refuse a port that is taken; viser would take another one and not report it."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-        except OSError as error:
-            raise ArgumentError(
-                f"{host}:{port} cannot be served ({error.strerror}); "
-                "choose another --host or --port"
-            ) from error
+    except OSError as error:
+        raise ArgumentError(
+            f"{host}:{port} cannot be served ({error.strerror}); choose another --host or --port"
+        ) from error

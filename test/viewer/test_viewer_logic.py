@@ -18,7 +18,7 @@ from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
 from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
-from eschorty_ros.viewer.page import Page, open_when_served
+from eschorty_ros.viewer.page import Page, open_when_served, page_url
 from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
 from eschorty_ros.viewer.status import Status, laser_text, points_text
 
@@ -214,6 +214,28 @@ def test_only_the_pages_own_requests_are_answered(served, name, origin, status):
         connection.request("GET", "/", headers=headers | more)
         assert connection.getresponse().status == wanted
         connection.close()
+
+
+def test_the_address_of_a_page_can_be_opened():
+    assert page_url("127.0.0.1", 8535) == "http://127.0.0.1:8535"
+    assert page_url("::1", 8535) == "http://[::1]:8535"
+    # Those of all interfaces are no address of a server.
+    for host in ("0.0.0.0", "::"):
+        assert page_url(host, 8535) == f"http://{socket.gethostname()}:8535"
+
+
+def test_a_page_is_served_on_an_ipv6_address():
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6) as probe:
+            port = probe.getsockname()[1]
+    except OSError:
+        pytest.skip("this computer has no IPv6")
+    page = Page(GrowingCloud(), host="::1", port=port)
+    connection = http.client.HTTPConnection("::1", port, timeout=10.0)
+    connection.request("GET", "/")
+    assert connection.getresponse().status == 200
+    connection.close()
+    page.stop()
 
 
 def test_a_page_that_reads_nothing_is_no_open_page(served):
