@@ -48,6 +48,14 @@ _BY_CHANCE = 2.0 * np.sqrt(3.0)
 _PRODUCT_MIN = 0.5
 
 
+class Followed(NamedTuple):
+    """Numbers of points: all, with a shift beside motion, and with events of one polarity alone."""
+
+    points: np.int64
+    shifted: np.int64
+    of_one_polarity: np.int64
+
+
 class Bursts(NamedTuple):
     """Sums over recent profiles by block of columns, polarity and part of the burst.
 
@@ -131,21 +139,17 @@ def _difference(bursts, block, polarity, explained_px):
 
 @kernel(_nrt=False)
 def _points_followed(history):
-    """Return the points where the sums are of enough profiles.
-
-    Besides, how many of them have a shift that is not in the direction of the line's motion, and
-    how many are of events of one polarity.
-    """
+    """Return the points where the sums are of enough profiles, by what the sums show."""
     followed, shifted, of_one = 0.0, 0.0, 0.0
     for block in range(1, history.shift_px.size - 1):
         if history.recent.profiles[block] >= RECENT_PROFILES:
             points = history.now.points[block]
             followed += points
-            step_px = history.recent.last[block] - history.recent.row[block]
-            ahead = history.step_px[block] > 0.0 and history.shift_px[block] * step_px > 0.0
+            moved_px = history.recent.last[block] - history.recent.row[block]
+            ahead = history.step_px[block] > 0.0 and history.shift_px[block] * moved_px > 0.0
             shifted += points if history.shift_px[block] != 0.0 and not ahead else 0.0
             of_one += points if _has_one_polarity(history.polarities, block) else 0.0
-    return np.int64(followed), np.int64(shifted), np.int64(of_one)
+    return Followed(np.int64(followed), np.int64(shifted), np.int64(of_one))
 
 
 @kernel(_nrt=False)

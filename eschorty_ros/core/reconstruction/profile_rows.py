@@ -415,10 +415,10 @@ def _close(memory):
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     _mark_unusual(rows, smoothing, memory.light.lit_share)
-    followed, shifted, of_one_polarity = _points_followed(smoothing.widths.history)
-    counters.points_followed += followed
-    counters.points_burst_shift += shifted
-    counters.points_one_polarity += of_one_polarity
+    followed = _points_followed(smoothing.widths.history)
+    counters.points_followed += followed.points
+    counters.points_burst_shift += followed.shifted
+    counters.points_one_polarity += followed.of_one_polarity
     _learn_line(memory, half, learns, late)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, memory.light)
