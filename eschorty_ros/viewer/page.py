@@ -285,7 +285,7 @@ def _is_loopback(host: str) -> bool:
 
 def page_url(host: str, port: int) -> str:
     """Return the address of a page, by this computer's name where it is served on every address."""
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host  # noqa: S104
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
