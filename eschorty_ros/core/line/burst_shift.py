@@ -49,7 +49,7 @@ _PRODUCT_MIN = 0.5
 
 
 class Followed(NamedTuple):
-    """Numbers of points: all, with a shift beside motion, and with events of one polarity alone."""
+    """Numbers of points: all, with a shift that no motion explains, and of one polarity alone."""
 
     points: np.int64
     shifted: np.int64
