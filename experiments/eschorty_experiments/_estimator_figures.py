@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, NamedTuple
 
 from eschorty_ros.core.line import FULL_COLUMN_METHODS, METHODS
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WINDOWED = tuple(name for name in METHODS if name not in FULL_COLUMN_METHODS)
+_MARKERS = "os^vDP"
 
 
 class Case(NamedTuple):
@@ -49,7 +51,7 @@ def bounds_figure(cases: list[Case]) -> Figure:
     for axes, (field, label, chosen), title in zip(
         figure.subplots(1, 3, sharey=True), panels, titles, strict=True
     ):
-        for method, marker in zip(METHODS, "os^", strict=True):
+        for method, marker in zip(METHODS, cycle(_MARKERS), strict=False):
             line = [case for case in cases if case.method == method and chosen(case)]
             values = [getattr(case, field) for case in line]
             axes.plot(values, [case.over_bound for case in line], marker + "-", label=method)
@@ -70,7 +72,7 @@ def returns_figure(cases: list[Case], seconds: list[Second]) -> Figure:
     """Draw the shares of gross errors and of reported second lines."""
     figure = new_figure(11.0, 4.4)
     gross, strength, apart = figure.subplots(1, 3)
-    for method, marker in zip(METHODS, "os^", strict=True):
+    for method, marker in zip(METHODS, cycle(_MARKERS), strict=False):
         kind = (method, 20.0, 0.3)
         line = [case for case in cases if (case.method, case.fwhm_px, case.background) == kind]
         shares = [100.0 * case.gross for case in line]

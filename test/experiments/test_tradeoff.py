@@ -71,7 +71,7 @@ def table_lines():
 def test_the_page_shows_the_settings_of_this_code():
     shown = [line.split("|")[1].strip() for line in table_lines()[2:]]
     expected = [variant.label for variant in one_change()]
-    assert shown == expected, "run `make tradeoff`"
+    assert shown == expected, "run `make tradeoff`, for minutes: all its times change"
     assert all(len(line.split("|")) == len(table_lines()[0].split("|")) for line in table_lines())
 
 

@@ -154,7 +154,7 @@ def _learns(footprint):
 
 @kernel(_nrt=False, forceinline=True)
 def _refine(column, at, window, line_variance, estimator, footprint, row_counts, windows):
-    """Set the row of a window's line that a learned footprint or the median gives.
+    """Set the row of a window's line where a learned footprint or the method gives another one.
 
     ``at`` is the place of the return: its number and its column.
     """

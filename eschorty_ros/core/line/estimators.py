@@ -18,8 +18,10 @@ FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
 
 # Codes are indices of the tuples above.
-_MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
-_STRONGEST, _, _LAST, _ALL = range(4)
+_MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = map(
+    CENTROIDS.index, ("mode_mean", "mean", "median", "learned")
+)
+_STRONGEST, _LAST, _ALL = map(RETURNS.index, ("strongest", "last", "all"))
 
 FWHM_PER_SIGMA = 2.3548200450309493
 # Least half width of a window, fixed point.

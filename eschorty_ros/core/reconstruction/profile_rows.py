@@ -222,9 +222,9 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
 
 
 def first_choice(settings: Settings) -> int:
-    """Return `MEAN_ROWS` where settings fix the means, else `UNDECIDED`."""
-    means = settings.centroid == "mode_mean" and settings.detail == "off"
-    return MEAN_ROWS if means or settings.centroid in FULL_COLUMN_METHODS else UNDECIDED
+    """Return `UNDECIDED` where rows may be those of a learned footprint, else `MEAN_ROWS`."""
+    learns = settings.centroid == "mode_mean" and settings.detail == "auto"
+    return UNDECIDED if learns or settings.centroid == "learned" else MEAN_ROWS
 
 
 def _factor_max(settings: Settings) -> float:

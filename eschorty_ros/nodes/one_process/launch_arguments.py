@@ -24,7 +24,7 @@ from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.stage.parameters import stage_limits
 from eschorty_ros.simulation.pixels import PRESETS
-from eschorty_ros.simulation.scenes import named
+from eschorty_ros.simulation.scenes import NAMES, named
 
 EVENTS = f"{NAMESPACE}/camera/events"
 BOOLEAN = ("true", "false")
@@ -71,8 +71,7 @@ _RVIZ = Argument("rviz", "false", "true: show cloud, live profile and frames in 
 SCAN = (
     *_DEVICES,
     _FILE,
-    Argument("scene", "steps", "what stands on an emulated bench: steps, plane, tilted, sphere, "
-             "leaves, face, posts, receding or a mesh"),
+    Argument("scene", "steps", f"what stands on an emulated bench: {', '.join(NAMES)} or a mesh"),
     Argument("calibration", "config_3", "optical build: a name in config/ or the path of a file"),
     Argument("speed", "0.05", "stage speed, m/s"),
     Argument("start", "0.01", "stage position where the sweep begins, m"),

@@ -62,6 +62,14 @@ def test_sigma_covers_the_bias_of_a_line_cut_by_the_sensor(method, row):
     assert np.mean(np.abs(error) < 2 * found.sigma_row) > 0.95, f"seed {SEED}"
 
 
+def test_every_method_gives_a_row_of_its_own():
+    rows = np.repeat([300, 301, 302, 304, 306, 309, 340], [9, 8, 7, 3, 2, 1, 2])
+    found = [float(estimate(rows, [0, rows.size], method=name).row[0]) for name in METHODS]
+    assert len(set(found)) == len(METHODS), dict(zip(METHODS, found, strict=True))
+    assert found[METHODS.index("mean")] == pytest.approx(rows.mean())
+    assert found[METHODS.index("median")] == pytest.approx(np.median(rows), abs=0.5)
+
+
 def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
     line = np.arange(290, 311).repeat(2)
     sigma = {}
