@@ -353,7 +353,7 @@ def _copy(counts, numbers, other_counts, other_numbers):
 
 @kernel(_nrt=False)
 def _pass(words, progress, decoder, span, edges, memory, before):
-    """Do the work of `_merge_words`; ``before`` has room for what a full column undoes."""
+    """Decode words as `_merge_words`, without references; ``before`` is room to undo a part in."""
     columns, gate, state = memory.columns, memory.gate.state, memory.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge

@@ -201,7 +201,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
         known_widths=empty_usual_widths(),
-        scatter=empty_scatter(model.columns, _factor_max(settings)),
+        scatter=empty_scatter(model.columns, FACTOR_MAX if windowed else 0.0),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
             settings.smoothing_gate_px,
@@ -225,11 +225,6 @@ def first_choice(settings: Settings) -> int:
     """Return `UNDECIDED` where rows may be those of a learned footprint, else `MEAN_ROWS`."""
     learns = settings.centroid == "mode_mean" and settings.detail == "auto"
     return UNDECIDED if learns or settings.centroid == "learned" else MEAN_ROWS
-
-
-def _factor_max(settings: Settings) -> float:
-    """Return the largest factor of a variance by the scatter of rows."""
-    return 0.0 if settings.centroid in FULL_COLUMN_METHODS else FACTOR_MAX
 
 
 @entry_kernel(_nrt=True)

@@ -34,7 +34,7 @@ def m_from_mm(millimetres: float) -> float:
 
 
 def odometry(names: Frames, t_ns: int, position_mm: float) -> Odometry:
-    """Return the message of a stage at rest."""
+    """Return the message of a stage's position, with a speed of zero."""
     message = Odometry(child_frame_id=names.stage)
     message.header.frame_id = names.base
     message.header.stamp = stamp_from_ns(t_ns)
