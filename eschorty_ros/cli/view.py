@@ -142,7 +142,7 @@ def serve_cloud(points: Points, host: str, port: int) -> None:
     page = Page(shown, host=host, port=port)
     shown.add(points)
     with ended_by_signals():
-        click.echo(f"page at {page.url}; Ctrl-C ends it")
+        click.echo(f"page at {page.url} (Ctrl-C ends it)")
         try:
             while True:
                 page.show(points_text)

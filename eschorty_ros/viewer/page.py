@@ -16,7 +16,7 @@ import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from ipaddress import ip_address
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,10 @@ _NAMES = {
     "frequency_hz": "frequency (Hz)", "duty": "duty, 0: as it is", "passes": "passes",
     "record": "record into",
 }  # fmt: skip
-_AHEAD = 1.3
+_AHEAD = 0.9
+# Growth of a cloud that the pages follow.
+_GROWTH = 1.2
+_ROUNDED_M = 1e-4
 _SERVED_S, _POLL_S = 300.0, 0.5
 _UNREAD_S = 5.0
 
@@ -69,7 +72,9 @@ class Page:
         self._cloud = cloud
         self._control = control
         self._drawn: tuple[int, str, float] | None = None
-        self._centre: NDArray[np.float64] | None = None
+        self._points: Any = None
+        self._box: _Box | None = None
+        self._aims: dict[int, NDArray[np.float64]] = {}
         self._lock = threading.Lock()
         # A stopped server takes no more.
         self._serving = threading.Lock()
@@ -89,6 +94,7 @@ class Page:
         gui.configure_theme(show_share_button=False, show_logo=False)
         self._colour = gui.add_dropdown("colour", COLOURS)
         self._size = gui.add_slider("point size (mm)", 0.1, 5.0, 0.1, 0.8)
+        self._scale = gui.add_image(_scale_image(), format="png")
         self._text = gui.add_markdown("")
         if self._control is None:
             return
@@ -100,16 +106,15 @@ class Page:
     def _connected(self, client: Any) -> None:
         """Aim the camera and give the page its controls: no other page sees its code."""
         self._aim(client)
-        if self._control is None:
+        if self._control is None or not self._control.allowed:
             return
-        allowed = self._control.allowed
         with client.gui.add_folder("scan"):
             fields = {}
             for name, value in ScanValues()._asdict().items():
                 add = client.gui.add_text if isinstance(value, str) else client.gui.add_number
-                fields[name] = add(_NAMES[name], value, disabled=not allowed)
-            code = client.gui.add_text("code", "", disabled=not allowed)
-            start = client.gui.add_button("Start scan", disabled=not allowed, color="red")
+                fields[name] = add(_NAMES[name], value)
+            code = client.gui.add_text("code", "")
+            start = client.gui.add_button("Start scan", color="red")
             cancel = client.gui.add_button("Cancel scan")
 
         def request(_: Any) -> None:
@@ -174,26 +179,35 @@ class Page:
         self, xyz: NDArray[np.float32], values: NDArray[np.float32], size_mm: float
     ) -> tuple[float, float]:
         rgb, limits = colours(values)
-        if len(xyz) and self._centre is None:
-            self._centre = np.asarray(np.median(xyz, axis=0), np.float64)
-            self._spread = max(float(np.ptp(xyz, axis=0).max()), 0.02)
+        if not len(xyz):
+            self._box = None
+            if self._points is not None:
+                self._points.remove()
+                self._points = None
+            return limits
+        box = _extent(xyz)
+        if self._box is None or box.size_m > _GROWTH * self._box.size_m:
+            self._box = box
             for client in self.server.get_clients().values():
                 self._aim(client)
-        if not len(xyz):
-            self._centre = None
-        self.server.scene.add_point_cloud(
+        self._points = self.server.scene.add_point_cloud(
             "/cloud", xyz, rgb, point_size=size_mm * 1e-3, precision="float32",
             point_shading="flat", point_shape="circle",
         )  # fmt: skip
         return limits
 
     def _aim(self, client: Any) -> None:
-        """Look at the cloud from the instrument's side."""
-        if self._centre is None:
+        """Look at the cloud from the instrument's side, unless the page's user looks elsewhere."""
+        if self._box is None:
             return
-        back = _AHEAD * self._spread
-        client.camera.position = self._centre + np.array([-back, -0.4 * back, 0.3 * back])
-        client.camera.look_at = self._centre
+        aimed = self._aims.get(client.client_id, client.camera.position)
+        # The browser rounds.
+        if not np.allclose(client.camera.position, aimed, atol=_ROUNDED_M):
+            return
+        back = _AHEAD * self._box.size_m
+        aim = self._box.centre_m + np.array([-back, -0.4 * back, 0.3 * back])
+        client.camera.position = self._aims[client.client_id] = aim
+        client.camera.look_at = self._box.centre_m
 
     def _show_profile(self, z_mm: NDArray[np.float64], range_mm: NDArray[np.float64]) -> None:
         from viser import uplot
@@ -214,6 +228,23 @@ class Page:
         with self._serving, contextlib.redirect_stdout(None):
             self._stopped = True
             self.server.stop()
+
+
+class _Box(NamedTuple):
+    """Centre and largest extent of the central 98 % of the points along each axis."""
+
+    centre_m: NDArray[np.float64]
+    size_m: float
+
+
+def _extent(xyz: NDArray[np.float32]) -> _Box:
+    low, high = np.percentile(xyz, (1.0, 99.0), axis=0)
+    return _Box((low + high) / 2.0, max(float((high - low).max()), 0.02))
+
+
+def _scale_image() -> NDArray[np.uint8]:
+    """Return the colours from the least to the greatest value, left to right."""
+    return np.tile(colours(np.linspace(0.0, 1.0, 256, dtype=np.float32))[0], (12, 1, 1))
 
 
 def _private(viser: ModuleType) -> Any:

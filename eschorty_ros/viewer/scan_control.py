@@ -32,6 +32,14 @@ class ScanValues(NamedTuple):
     passes: int = 1
     record: str = ""
 
+    def __str__(self) -> str:
+        duty = f", duty {self.duty:g}" if self.duty else ""
+        record = f", recorded into {self.record}" if self.record else ""
+        return (
+            f"{self.start_mm:g} to {self.stop_mm:g} mm at {self.speed_mm_s:g} mm/s, "
+            f"{self.frequency_hz:g} Hz{duty}, passes: {self.passes}{record}"
+        )
+
 
 @dataclass(frozen=True)
 class Conditions:

@@ -29,7 +29,7 @@ class Status:
             ("events/s", "no report" if self.events_per_second != self.events_per_second
              else f"{self.events_per_second:,.0f}"),
             *((name.replace("_", " "), f"{count:,}") for name, count in self.counts.items()),
-            ("points here", points_text(received, stride)),
+            ("here", points_text(received, stride)),
         ]  # fmt: skip
         lines = ["| | |", "| --- | --- |"]
         lines += [f"| {name} | {_plain(text)} |" for name, text in rows]
@@ -38,7 +38,8 @@ class Status:
 
 def points_text(received: int, stride: int) -> str:
     """Return how many points there are and how many are drawn."""
-    return f"{received:,}, {'all' if stride == 1 else f'every {stride:,}th'} drawn"
+    drawn = "all" if stride == 1 else f"1 in {stride:,}"
+    return f"{received:,} points, {drawn} drawn"
 
 
 def laser_text(output: int, armed: bool) -> str:

@@ -141,7 +141,7 @@ def test_the_text_names_laser_and_losses_and_carries_no_markup():
     status = Status(laser=laser_text(1, True), reason="a|b <img src=x>", phase="sweeping",
                     progress=0.5, counts={"packets_lost": 1234})  # fmt: skip
     text = status.markdown(10_000, 4)
-    for words in ("**ON**", "sweeping 50%", "packets lost | 1,234", "10,000, every 4th drawn"):
+    for words in ("**ON**", "sweeping 50%", "packets lost | 1,234", "10,000 points, 1 in 4 drawn"):
         assert words in text
     assert "<img" not in text
     assert [laser_text(*state) for state in ((0, True), (2, False), (77, True))] == [
@@ -238,19 +238,56 @@ def test_a_page_is_served_on_an_ipv6_address():
     page.stop()
 
 
-def test_a_page_that_reads_nothing_is_no_open_page(served):
-    """A computer that has vanished or stalled keeps no scan going."""
-    url = f"ws://127.0.0.1:{served.server.get_port()}"
+def connected(page, **options):
+    """A client of ``page`` that looks along x, without a browser."""
+    url = f"ws://127.0.0.1:{page.server.get_port()}"
+    own = Subprotocol(f"viser-v{viser.__version__}")
+    client = connect(url, subprotocols=[own], max_size=None, **options)
+    look_from(client, (0, 0, 0))
+    return client
+
+
+def look_from(client, position):
     camera = {
-        "type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0,
+        "type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": position, "fov": 1.0,
         "near": 0.1, "far": 10.0, "image_height": 100, "image_width": 100, "look_at": (1, 0, 0),
         "up_direction": (0, 0, 1),
     }  # fmt: skip
-    own = Subprotocol(f"viser-v{viser.__version__}")
-    reading = connect(url, subprotocols=[own], max_queue=None, max_size=None)
-    stalled = connect(url, subprotocols=[own], max_queue=1, max_size=None)
-    for client in (reading, stalled):
-        client.send(msgspec.msgpack.encode(camera))
+    client.send(msgspec.msgpack.encode(camera))
+
+
+def wait_until(condition):
+    end_s = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+def test_the_view_follows_a_cloud_that_grows_until_its_user_changes_it(served):
+    client = connected(served, max_queue=None)
+    wait_until(lambda: served.pages == 1)
+    [camera] = (page.camera for page in served.server.get_clients().values())
+    distances_m = []
+    for size_m in (0.05, 0.1, 0.2):
+        points = numbered(0, 100)
+        points["x"], points["y"], points["z"] = 1.0, np.linspace(0.0, size_m, 100), 0.0
+        served._cloud.add(points)
+        served.show(points_text)
+        distances_m.append(np.linalg.norm(camera.position - [1.0, size_m / 2.0, 0.0]))
+    assert np.all(np.diff(distances_m) > 0.03)
+    own = (0.5, 0.4, 0.3)
+    look_from(client, own)
+    wait_until(lambda: np.allclose(camera.position, own))
+    points["y"] *= 10.0
+    served._cloud.add(points)
+    served.show(points_text)
+    assert np.allclose(camera.position, own)
+    client.close()
+
+
+def test_a_page_that_reads_nothing_is_no_open_page(served):
+    """A computer that has vanished or stalled keeps no scan going."""
+    reading, stalled = (connected(served, max_queue=length) for length in (None, 1))
     end_s = time.monotonic() + 30.0
     while served.pages < 2:
         assert time.monotonic() < end_s

@@ -184,7 +184,8 @@ class ViewerNode(Node):
         self._release()
 
     def _begin(self, values: ScanValues) -> None:
-        self._status.message, self._scanner_s = "", time.monotonic()
+        # The browser may drop a change that is followed by the click within 50 ms.
+        self._status.message, self._scanner_s = f"requested: {values}", time.monotonic()
         self._cancel_wanted = False
         goal = Scan.Goal(
             start=m_from_mm(values.start_mm),
