@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
+from eschorty_ros.core.base.pointer import Pointer
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
@@ -95,7 +96,9 @@ class ProfileAssembler:
         self._use(allocate(settings, model))
 
     def _use(self, memory: Memory) -> None:
-        self._memory, self._boxed, self._state = memory, Boxed(memory), memory.state
+        self._memory, self._state = memory, memory.state
+        self._boxed_memory = Boxed(memory)
+        self._boxed = Boxed(_Open(self._boxed_memory, Pointer(_end, self._boxed_memory)))
 
     def restart(self, modulation: Modulation, every: int) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``.
@@ -123,7 +126,7 @@ class ProfileAssembler:
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
         self._memory.known_widths.number[:] = 0.0
         self._memory.known_widths.median["difference"] = 0.0
-        _begin_window(self._memory)
+        _end(self._boxed_memory)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
         """Begin a window, and its first period at an edge, with the settings of ``before``.
@@ -147,7 +150,8 @@ class ProfileAssembler:
         self._state["rows"] = 0
         self._done = []
         self._memory.footprint.state["near_edge"] = 0
-        _begin_window(self._memory)
+        self._state["status"] = CLOSED
+        _end(self._boxed_memory)
         self._state["status"] = EMPTY
         self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
         self._state["period"] = edges.period[edge]
@@ -283,12 +287,31 @@ def _fill(events, first, limit_us, memory):
     return appended.next
 
 
+class _Open(NamedTuple):
+    """Memory of the open period, and the kernel that ends it."""
+
+    memory: Boxed
+    end: Pointer
+
+
+@entry_kernel
+def _end(boxed):
+    """Turn the open period into rows; begin a window where none is open. Return ``True``."""
+    memory = boxed.content
+    if memory.state.status == FILLED:
+        _close(memory)
+    else:
+        _begin_window(memory)
+    return True
+
+
 @kernel(inline="always")
-def _begin_period(edges, edge, memory):
+def _begin_period(edges, edge, period, memory):
     """Close the open period and begin the next at an edge."""
     state = memory.state
     if state.status == FILLED:
-        _close(memory)
+        if not period.end(period.memory):
+            raise RuntimeError("a profile failed; the reason is above")
     elif state.status == EMPTY:
         memory.counters.periods_empty += 1
     state.status = EMPTY
@@ -297,7 +320,7 @@ def _begin_period(edges, edge, memory):
 
 
 @kernel(inline="always")
-def _merge_part(events, edges, i, edge, drain, memory):
+def _merge_part(events, edges, i, edge, drain, period, memory):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
     state, rows_max = memory.state, memory.output.row.size - memory.rows.row.size
     t, edges_us = events.t, edges.t_us
@@ -316,7 +339,7 @@ def _merge_part(events, edges, i, edge, drain, memory):
         first, next_us = edge, t[i] if i < t.size else far
         while edge + 1 < edges_us.size and edges_us[edge + 1] <= next_us:
             edge += 1
-        _begin_period(edges, edge, memory)
+        _begin_period(edges, edge, period, memory)
         memory.counters.periods_empty += edge - first
         edge += 1
 
@@ -328,13 +351,14 @@ def _merge(held, new, edges, progress, boxed):
     A period is closed when an event reaches its end or after the last event. Events and edges
     remain when the output has no room for another profile.
     """
-    memory, size = boxed.content, held.t.size
+    period, size = boxed.content, held.t.size
+    memory = period.memory.content
     i, edge = progress
     if i < size:
-        i, edge = _merge_part(held, edges, i, edge, False, memory)
+        i, edge = _merge_part(held, edges, i, edge, False, period, memory)
         if i < size:
             return _Progress(i, edge)
-    i, edge = _merge_part(new, edges, i - size, edge, True, memory)
+    i, edge = _merge_part(new, edges, i - size, edge, True, period, memory)
     return _Progress(size + i, edge)
 
 
@@ -352,7 +376,7 @@ def _copy(counts, numbers, other_counts, other_numbers):
 
 
 @kernel(_nrt=False)
-def _pass(words, progress, decoder, span, edges, memory, before):
+def _pass(words, progress, decoder, span, edges, period, memory, before):
     """Decode words as `_merge_words`, without references; ``before`` is room to undo a part in."""
     columns, gate, state = memory.columns, memory.gate.state, memory.state
     rows_max = memory.output.row.size - memory.rows.row.size
@@ -391,7 +415,7 @@ def _pass(words, progress, decoder, span, edges, memory, before):
             break
         filled = state.status == FILLED
         learning = state.known_half == 0
-        _begin_period(edges, edge, memory)
+        _begin_period(edges, edge, period, memory)
         edge += 1
         learned = learning and state.known_half > 0
         if span.one_window and filled and (learned or state.window == 0):
@@ -407,6 +431,7 @@ def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     It ends before the first event at the end of ``span`` or later, and before a trigger. Words
     and edges remain when a column or the output has no room.
     """
-    memory, decoder = boxed.content, boxed_decoder.content
+    period, decoder = boxed.content, boxed_decoder.content
+    memory = period.memory.content
     before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
-    return _pass(words, progress, decoder, span, edges, memory, before)
+    return _pass(words, progress, decoder, span, edges, period, memory, before)

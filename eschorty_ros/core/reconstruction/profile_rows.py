@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blinking import Blink, _add_lines
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.burst_shift import (
@@ -227,7 +227,7 @@ def first_choice(settings: Settings) -> int:
     return UNDECIDED if learns or settings.centroid == "learned" else MEAN_ROWS
 
 
-@entry_kernel(_nrt=True)
+@kernel(_nrt=True)
 def _begin_window(memory):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
     state = memory.state

@@ -108,6 +108,45 @@ def test_a_kernel_that_only_kernels_call_refuses_a_call_from_python(tmp_path):
         )
 
 
+POINTED = """
+from typing import NamedTuple
+
+from eschorty_ros.core.base.kernel import entry_kernel, kernel
+from eschorty_ros.core.base.pointer import Pointer
+
+@entry_kernel
+def _checked(x):
+    if x > 2:
+        raise ValueError(f"{x} is too much")
+    return True
+
+class Called(NamedTuple):
+    check: Pointer
+
+@kernel(_nrt=False)
+def _count(x, called):
+    for i in range(x):
+        if not called.check(i):
+            return i
+    return x
+
+@entry_kernel
+def _counted(x, called):
+    return _count(x, called)
+
+called = Called(Pointer(_checked, 1))
+print(_counted(2, called), _counted(9, called))
+"""
+
+
+def test_a_kernel_called_by_its_address_reports_what_it_raises(tmp_path):
+    """Also one that comes from the cache, in the second process."""
+    (tmp_path / "pointed.py").write_text(POINTED)
+    for _ in range(2):
+        printed = output(tmp_path, str(tmp_path / "pointed.py"))
+        assert printed == "2 3\n"
+
+
 def test_boxed_arrays_are_compiled_once():
     """The kernel's cache refers to types of modules that import it, so that it is read late."""
     code = """
