@@ -244,7 +244,7 @@ def _extent(xyz: NDArray[np.float32]) -> _Box:
 
 def _scale_image() -> NDArray[np.uint8]:
     """Return the colours from the least to the greatest value, left to right."""
-    return np.tile(colours(np.linspace(0.0, 1.0, 256, dtype=np.float32))[0], (12, 1, 1))
+    return np.tile(colours(np.linspace(0.0, 1.0, 640, dtype=np.float32))[0], (24, 1, 1))
 
 
 def _private(viser: ModuleType) -> Any:

@@ -81,7 +81,11 @@ EVK4_TABLE = (
         dynamic=True,
     ),
     Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
-    Param("trail_filter", False, "filter of trailing events" + _IGNORED),
+    Param(
+        "trail_filter",
+        False,
+        "filter of trailing events: those left of a moving line are ahead of it" + _IGNORED,
+    ),
     Param("trail_filter_type", "trail", "kind of that filter", choices=TRAIL_TYPES),
     Param(
         "trail_filter_threshold",
