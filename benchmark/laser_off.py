@@ -2,7 +2,7 @@
 
 A busy process runs on each core (--busy). Every fault is repeated; median and worst are printed.
 
-Usage: PYTHONPATH=test/support:$PYTHONPATH python benchmark/laser_off.py [FAULT...]
+Usage: python benchmark/laser_off.py [FAULT...]
 """
 
 import argparse
@@ -17,8 +17,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from safety_bench import SENDERS, SafetyBench, guard_of, running
 from std_msgs.msg import String
+
+sys.path.append(str(Path(__file__).parents[1] / "test" / "support"))
+
+from safety_bench import SENDERS, SafetyBench, guard_of, running
 
 Fault = Callable[[SafetyBench], int]
 

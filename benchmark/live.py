@@ -1,7 +1,7 @@
 """What a reconstruction node sustains: packets in, profiles out, through DDS as shipped.
 
-Usage: PYTHONPATH=benchmark:test/support:$PYTHONPATH python benchmark/live.py [--frequency HZ...]
-           [--packet-ms MS...] [--rate R...] [--seconds S] [--reliable] [--soak MINUTES]
+Usage: python benchmark/live.py [--frequency HZ...] [--packet-ms MS...] [--rate R...]
+           [--seconds S] [--reliable] [--soak MINUTES]
 
 A process publishes a simulated line of 1280 columns as EventPackets, with the stage's odometry, at
 a multiple of real time into a reconstruction node that is a process of its own; this one subscribes
@@ -51,6 +51,7 @@ COLUMNS_SHOWN = {
     "per CPU s": "9.1f", "offline": "8.1f", "cores": "6.2f", "publisher": "9.2f", "MB": "6.0f",
     MINUTE: "6.0f", "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
 }  # fmt: skip
+SUPPORT = Path(__file__).parents[1] / "test" / "support"
 NODE = "eschorty_ros.nodes.reconstruction.node"
 
 
@@ -176,6 +177,7 @@ def reconstruction(domain: int, reliable: bool) -> Iterator[subprocess.Popen[byt
 
 def measured(arguments: argparse.Namespace) -> tuple[float, ...]:
     """Return one row of the table."""
+    sys.path.append(str(SUPPORT))
     from eschorty_ros.msg import ReconstructionState
     from ros_process import Observer
     from sensor_msgs.msg import PointCloud2

@@ -1,7 +1,6 @@
 """Write docs/performance.md: the speed of decoding and reconstruction on this computer.
 
-Usage: PYTHONPATH=benchmark:test/support:$PYTHONPATH python benchmark/performance.py [--seconds S]
-           [--repeats N] [--out FILE]
+Usage: python benchmark/performance.py [--seconds S] [--repeats N] [--out FILE]
 """
 
 from __future__ import annotations
