@@ -203,6 +203,7 @@ def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
         ((targets_csv, "--range-per-stage", 0.5), "--range-per-stage belongs to --moving"),
         ((tmp_path / "rec", "--moving", 5, "--row-sigma", 1), "is for a targets.csv"),
         (("--fake", "--range-sigma", 2), "--range-sigma belongs to --distances"),
+        (("--fake", "--distances", "820,1.2m"), "--distances is 820,1.2m; give millimetres"),
     ):
         done = run(*arguments)
         assert done.exit_code == 2, done.output
