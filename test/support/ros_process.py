@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+import waiting
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMsg
@@ -24,10 +25,11 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from waiting import DEADLINE_S, wait_until
+from waiting import DEADLINE_S
 
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile
+from eschorty_ros.nodes.ros.dds_deadlock import DdsDeadlock
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
@@ -35,6 +37,19 @@ from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 NAMESPACE = "/eschorty"
 # With util-linux the kernel ends the nodes however the tests end.
 _ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+_DDS = DdsDeadlock()
+
+
+def wait_until(
+    condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S, poll_s: float = 0.02
+) -> Any:
+    """As ``waiting.wait_until``; fails at once where DDS is deadlocked in this process."""
+
+    def look() -> Any:
+        _DDS.look()
+        return condition()
+
+    return waiting.wait_until(look, what, deadline_s, poll_s)
 
 
 def ros_minus_steady_ns() -> int:
