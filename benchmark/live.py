@@ -39,6 +39,8 @@ from eschorty_ros.core.reconstruction import Reconstructor, Settings
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 
+sys.path.append(str(Path(__file__).parents[1] / "test" / "support"))
+
 SEED, RANGE_MM, COLUMNS = 1, 1320.0, 1280
 # A step of TIME_HIGH is 4096 us; 70.3125 Hz and 1 kHz have whole periods in 125 of them.
 LOOP_US = 2 * 125 * 4096
@@ -51,7 +53,6 @@ COLUMNS_SHOWN = {
     "per CPU s": "9.1f", "offline": "8.1f", "cores": "6.2f", "publisher": "9.2f", "MB": "6.0f",
     MINUTE: "6.0f", "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
 }  # fmt: skip
-SUPPORT = Path(__file__).parents[1] / "test" / "support"
 NODE = "eschorty_ros.nodes.reconstruction.node"
 
 
@@ -177,7 +178,6 @@ def reconstruction(domain: int, reliable: bool) -> Iterator[subprocess.Popen[byt
 
 def measured(arguments: argparse.Namespace) -> tuple[float, ...]:
     """Return one row of the table."""
-    sys.path.append(str(SUPPORT))
     from eschorty_ros.msg import ReconstructionState
     from ros_process import Observer
     from sensor_msgs.msg import PointCloud2

@@ -43,7 +43,7 @@ _DDS = DdsDeadlock()
 def wait_until(
     condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S, poll_s: float = 0.02
 ) -> Any:
-    """As ``waiting.wait_until``; fails at once where DDS is deadlocked in this process."""
+    """As ``waiting.wait_until``; fails after some 10 s where DDS is deadlocked in this process."""
 
     def look() -> Any:
         _DDS.look()

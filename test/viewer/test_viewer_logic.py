@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import viser
 from click.testing import CliRunner
+from waiting import wait_until
 from websockets import Subprotocol
 from websockets.sync.client import connect
 
@@ -256,16 +257,9 @@ def look_from(client, position):
     client.send(msgspec.msgpack.encode(camera))
 
 
-def wait_until(condition):
-    end_s = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
-
-
 def test_the_view_follows_a_cloud_that_grows_until_its_user_changes_it(served):
     client = connected(served, max_queue=None)
-    wait_until(lambda: served.pages == 1)
+    wait_until(lambda: served.pages == 1, "the page")
     [camera] = (page.camera for page in served.server.get_clients().values())
     distances_m = []
     for size_m in (0.05, 0.1, 0.2):
@@ -277,7 +271,7 @@ def test_the_view_follows_a_cloud_that_grows_until_its_user_changes_it(served):
     assert np.all(np.diff(distances_m) > 0.03)
     own = (0.5, 0.4, 0.3)
     look_from(client, own)
-    wait_until(lambda: np.allclose(camera.position, own))
+    wait_until(lambda: np.allclose(camera.position, own), "the user's view")
     points["y"] *= 10.0
     served._cloud.add(points)
     served.show(points_text)
@@ -288,10 +282,8 @@ def test_the_view_follows_a_cloud_that_grows_until_its_user_changes_it(served):
 def test_a_page_that_reads_nothing_is_no_open_page(served):
     """A computer that has vanished or stalled keeps no scan going."""
     reading, stalled = (connected(served, max_queue=length) for length in (None, 1))
+    wait_until(lambda: served.pages == 2, "both pages")
     end_s = time.monotonic() + 30.0
-    while served.pages < 2:
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
     while served.pages > 1:
         assert time.monotonic() < end_s, "still counted"
         served._cloud.add(numbered(0, 50_000))

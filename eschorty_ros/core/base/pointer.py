@@ -1,7 +1,7 @@
 """The address of a compiled function, as an argument of others.
 
-numba compiles a kernel again into each kernel that calls it, which for a large one takes as long as
-all the rest. One that is called by its address is compiled once.
+numba compiles a kernel again into each kernel that calls it; one that is called by its address is
+compiled once.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ print(_counted(2, called), _counted(9, called))
 """
 
 
-def test_a_kernel_called_by_its_address_reports_what_it_raises(tmp_path):
+def test_a_kernel_called_by_its_address_returns_false_where_it_raises(tmp_path):
     """Also one that comes from the cache, in the second process."""
     (tmp_path / "pointed.py").write_text(POINTED)
     for _ in range(2):

@@ -123,6 +123,8 @@ def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
         [goal] = first.goals
         assert (goal.stop, goal.duty, goal.passes) == pytest.approx((0.02, 0.3, 2))
         assert first.recorded == ["/data"]
+        assert "requested: 10 to 20 mm" in viewer._status.message
+        assert "duty 0.3, passes: 2, recorded into /data" in viewer._status.message
         ask(viewer)
         wait(says(viewer, "a scan is running"))
         first.release.set()
