@@ -4,10 +4,24 @@ import faulthandler
 import os
 import sys
 
+import pytest
+
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 _END_S = 60.0
+
+
+@pytest.fixture(scope="session")
+def open3d():
+    """Open3D, or a skip that says what it lacks."""
+    from eschorty_ros.core.base.errors import EschortyError
+    from eschorty_ros.simulation.scenes import load_open3d
+
+    try:
+        return load_open3d("this test")
+    except EschortyError as error:
+        pytest.skip(str(error))
 
 
 def pytest_unconfigure() -> None:

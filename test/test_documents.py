@@ -133,7 +133,7 @@ def relief(y, z):
 
 
 @pytest.fixture(scope="module")
-def made(folder):
+def made(folder, open3d):
     """The folder after the commands of the pages, in their order."""
     ran = 0
     with contextlib.chdir(folder):

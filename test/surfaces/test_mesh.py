@@ -10,11 +10,10 @@ from grid_clouds import PITCH_Y, PITCH_Z, cloud
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import write_cloud
-from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.mesh import mesh
 from eschorty_ros.surfaces.plane import POINTS_MIN
 
-open3d = load_open3d("the test")
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 def ball(y, z):
@@ -89,7 +88,7 @@ def test_what_cannot_be_meshed_has_one_line():
 
 
 @pytest.mark.parametrize("form", ["ply", "obj", "stl"])
-def test_the_command_writes_a_mesh_that_open3d_reads(tmp_path, form):
+def test_the_command_writes_a_mesh_that_open3d_reads(tmp_path, form, open3d):
     write_cloud(tmp_path / "c.pcd", cloud(ball))
     target = tmp_path / f"m.{form}"
     arguments = ["mesh", str(tmp_path / "c.pcd"), "--out", str(target)]

@@ -14,6 +14,8 @@ from eschorty_ros.core.storage import read_cloud, write_cloud
 from eschorty_ros.surfaces.grid import organise
 from eschorty_ros.surfaces.register import join, pose_matrix, register
 
+pytestmark = pytest.mark.usefixtures("open3d")
+
 
 def relief(y, z):
     waves = 6.0 * np.sin(y / 5.0 + 0.3 * np.sin(z / 9.0)) * np.cos(z / 7.0)

@@ -8,6 +8,9 @@ from types import ModuleType
 
 from eschorty_ros.core.base.errors import EschortyError
 
+# Debian's packages of the libraries that Open3D links and that a bare machine lacks.
+_LIBRARIES = "libegl1 libgl1 libx11-6"
+
 
 def load_open3d(purpose: str) -> ModuleType:
     """Return the module ``open3d``; the message of an error names ``purpose``, which needs it.
@@ -22,9 +25,10 @@ def load_open3d(purpose: str) -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
+        absent = isinstance(error, ModuleNotFoundError)
+        remedy = "pip install open3d libusb-package" if absent else f"apt install {_LIBRARIES}"
         raise EschortyError(
-            f"{purpose} needs open3d, which does not import here ({error}); "
-            "run: pip install open3d libusb-package"
+            f"{purpose} needs open3d, which does not import here ({error}); run: {remedy}"
         ) from error
     module: ModuleType = open3d
     return module

@@ -1,16 +1,14 @@
 """Clouds go through both file forms unchanged; other programs read them too."""
 
 from functools import partial
-from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.storage import POINT_DTYPE, Points, height_map, read_cloud, write_cloud
-from eschorty_ros.simulation.scenes import load_open3d
 
 EXTENSIONS = [".pcd", ".ply"]
 
@@ -27,14 +25,6 @@ def cloud(count: int, seed: int = 7) -> Points:
 
 def coordinates(points: Points) -> np.ndarray:
     return np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
-
-
-@pytest.fixture(scope="module")
-def open3d() -> ModuleType:
-    try:
-        return load_open3d("this test")
-    except EschortyError as error:
-        pytest.skip(str(error))
 
 
 def test_point_layout():

@@ -115,16 +115,16 @@ def test_a_mesh_without_open3d_names_the_package(tmp_path, monkeypatch) -> None:
         named(path)
 
 
-def open3d():
-    """Open3D, or a skip that names it."""
-    try:
-        return load_open3d("this test")
-    except EschortyError as error:
-        pytest.skip(str(error))
+def test_a_mesh_without_a_library_that_open3d_links_names_its_package(tmp_path, monkeypatch):
+    (tmp_path / "open3d.py").write_text("raise ImportError('libEGL.so.1: cannot open')")
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(EschortyError, match=r"libEGL.so.1: .*; run: apt install libegl1 "):
+        load_open3d("a mesh")
 
 
+@pytest.mark.usefixtures("open3d")
 def test_mesh_agrees_with_the_analytic_plane() -> None:
-    open3d()
     from eschorty_ros.simulation.scenes import Mesh
 
     plane = Plane(1320.0, slope_stage=0.5, slope_column=-0.4, pivot_mm=50.0)
@@ -135,12 +135,11 @@ def test_mesh_agrees_with_the_analytic_plane() -> None:
     assert np.max(np.abs(got - plane.range_mm(STAGE, COLUMNS, MODEL))) < 2e-3
 
 
-def test_mesh_file_agrees_with_the_analytic_sphere(tmp_path) -> None:
-    o3d = open3d()
-    ball = o3d.geometry.TriangleMesh.create_sphere(0.040, 300)
+def test_mesh_file_agrees_with_the_analytic_sphere(tmp_path, open3d) -> None:
+    ball = open3d.geometry.TriangleMesh.create_sphere(0.040, 300)
     ball.translate((1.320, 0.050, 0.0))
     path = tmp_path / "ball.ply"
-    assert o3d.io.write_triangle_mesh(str(path), ball)
+    assert open3d.io.write_triangle_mesh(str(path), ball)
     got = named(path).range_mm(STAGE, COLUMNS, MODEL)
     truth = Sphere(backdrop_mm=None).range_mm(STAGE, COLUMNS, MODEL)
     both = np.isfinite(got) & np.isfinite(truth)
@@ -152,8 +151,8 @@ def test_mesh_file_agrees_with_the_analytic_sphere(tmp_path) -> None:
     assert np.percentile(error, 98) < 0.1
 
 
+@pytest.mark.usefixtures("open3d")
 def test_an_empty_mesh_is_refused(tmp_path) -> None:
-    open3d()
     path = tmp_path / "empty.ply"
     path.write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
