@@ -1,9 +1,15 @@
-"""Points whose line is narrower or wider than the lines of its stream: they are on two surfaces.
+"""Points whose line is narrower or wider than the lines of its stream or beside it.
+
+They are on two surfaces.
 
 An edge of range or reflectance within the line's thickness leaves a part of the line, or two parts
 side by side, and moves the row by up to half of the change of the full width. A width is unusual
 when few lines of the stream have it for longer than a profile: the width of a line that a step
 crosses changes, that on a dark surface stays.
+
+The lens spreads light over near columns. At an edge that crosses the line, columns have light of
+both sides: their row is between those beside them, and their line is wider than either. Where a
+stream has many such edges these widths are usual, too.
 """
 
 from __future__ import annotations
@@ -163,6 +169,26 @@ def _unusual_variance(width, usual):
     return width * width - usual * usual
 
 
+@kernel(_nrt=False)
+def _mixed_variance(rows, smoothing, k, c, sigma_width):
+    """Return the variance of a row that is the mean of two surfaces, px squared, else 0.
+
+    It is between the rows two columns to either side, and that of a choice between these two. Its
+    line is wider by that, where a slope leaves the width as it is: half decides.
+    """
+    row, smoothed = smoothing.row, smoothing.widths.smoothed
+    pairs = np.intp(WIDTH_PAIRS)
+    left, right = c - pairs, c + pairs
+    if left < 0 or right >= row.shape[1]:
+        return 0.0
+    mixed2 = (row[k, c] - row[k, left]) * (row[k, right] - row[k, c])
+    if not mixed2 > _MARKED**2 * rows.sigma2[k, c]:
+        return 0.0
+    beside, variance = max(smoothed[k, left], smoothed[k, right]), rows.variance[k, c]
+    wider = np.sqrt(variance) - beside > _STEADY * sigma_width
+    return mixed2 if wider and 2.0 * (variance - beside * beside) > mixed2 else 0.0
+
+
 @kernel
 def _static_width(width, usual, displacement):
     """Return the width of a line less what its ``displacement`` while it is lit may add.
@@ -249,6 +275,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
+    sigma_own = np.sqrt(WIDTH_COLUMNS) * sigma
     pairs = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
@@ -271,6 +298,10 @@ def _mark_unusual(rows, smoothing, lit_share):
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, unusual2)
+            mixed2 = _mixed_variance(rows, smoothing, k, c, sigma_own) if known else 0.0
+            if mixed2 > 0.0:
+                rows.mixed[k, c] = True
+                more2 = max(more2, mixed2)
             sigma2[k, c] += more2
             if not abs(width - last[k, c]) > _STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
