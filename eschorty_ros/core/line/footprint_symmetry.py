@@ -30,7 +30,7 @@ _STRUCTURE_MIN = 4.0
 _SYMMETRIC = 0.1
 _ERROR_MAX = 2 * _PLACES
 # Share of the largest mean count at the ends of a footprint, and the distance of its mean from the
-# middle of these that is a fault: up to 0.2 on lines that move, 0.3 to 5 where one side is lost.
+# middle of these that is a fault: up to 0.2 on symmetric lines, 0.3 to 5 where one side is lost.
 _END_SHARE = 0.2
 _LOPSIDED_PX = 0.25
 
@@ -114,8 +114,12 @@ def _centre(pixels):
 
 
 @kernel
-def _is_lopsided(pixels):
-    """Return whether the mean of the counts by place is not in the middle of their ends."""
+def _is_lopsided(pixels, lit_way_px):
+    """Return whether the mean of the counts by place is not in the middle of their ends.
+
+    Of a line that moves while it is lit, rows at one end may have all events and as many at the
+    other none: that is half of its way.
+    """
     mean = _mean_counts(pixels).mean
     low = high = np.argmax(mean)
     least = _END_SHARE * mean[low]
@@ -125,4 +129,4 @@ def _is_lopsided(pixels):
         high += 1
     places = np.arange(low, high + 1)
     centre = (places * mean[low : high + 1]).sum() / max(mean[low : high + 1].sum(), 1e-9)
-    return abs(centre - 0.5 * (low + high)) > _LOPSIDED_PX * _PLACES
+    return abs(centre - 0.5 * (low + high)) > (_LOPSIDED_PX + 0.5 * lit_way_px) * _PLACES

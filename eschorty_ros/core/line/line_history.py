@@ -222,3 +222,14 @@ def _moves_fast(history):
             blocks += 1
             fast += history.step_px[block] > _FAST_PX
     return 2 * fast > blocks
+
+
+@kernel(_nrt=False)
+def _mean_step_px(history):
+    """Return by how much the line moves from profile to profile, the mean of blocks with points."""
+    blocks, total = 0, 0.0
+    for block in range(1, history.step_px.size - 1):
+        if history.now.points[block] > 0.0:
+            blocks += 1
+            total += history.step_px[block]
+    return total / max(blocks, 1)

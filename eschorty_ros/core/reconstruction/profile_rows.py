@@ -52,7 +52,7 @@ from eschorty_ros.core.line.learned_gate import (
     _use_late,
     make_gate,
 )
-from eschorty_ros.core.line.line_history import _compare_polarities
+from eschorty_ros.core.line.line_history import _compare_polarities, _mean_step_px
 from eschorty_ros.core.line.scatter import (
     FACTOR_MAX,
     Scatter,
@@ -377,7 +377,8 @@ def _learn_line(memory, half, learns, late):
         _restart_from(memory.known, footprint)
     if learns:
         computations, lopsided = footprint.state.computations, footprint.state.lopsided
-        _learn(footprint, rows, smoothing.row[0], estimator.sensor_rows)
+        lit_way_px = memory.light.lit_share * _mean_step_px(smoothing.widths.history)
+        _learn(footprint, rows, smoothing.row[0], estimator.sensor_rows, lit_way_px)
         counters.footprints += footprint.state.computations - computations
         counters.footprints_lopsided += footprint.state.lopsided - lopsided
     if state.known_half == 0:

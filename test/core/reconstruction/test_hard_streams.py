@@ -351,6 +351,20 @@ def test_a_line_that_has_lost_one_side_at_all_times_has_a_warning(lost, half_wid
     assert any("the line is lopsided" in line for line in reconstructor.warnings) == lost
 
 
+@pytest.mark.parametrize("towards", [1, -1])
+def test_a_line_that_moves_while_it_is_lit_is_not_lopsided(towards):
+    """Pixels that it reaches late give fewer ON events."""
+    camera = Camera(periods=30)
+    t, x, y, p = camera.moving_line(lambda k, c: 230.0 + 8.0 * k + 0.0 * c, 4)
+    late = (t - FIRST_EDGE_US) % camera.period_us > 0.05 * camera.period_us
+    kept = (p == 0) | ~late | (camera.rng.random(t.size) < 0.2)
+    t, x, y, p = (values[kept] for values in (t, x, y, p))
+    found, reconstructor = points(camera, (t, x, y if towards > 0 else 719 - y, p))
+    assert len(found) > 0.99 * camera.periods * CALIBRATION.columns, f"seed {camera.seed}"
+    assert reconstructor.counters["footprints"] > 0
+    assert not any("lopsided" in line for line in reconstructor.warnings)
+
+
 @pytest.mark.parametrize(("share", "error_max_mm"), [(0.22, 1.0), (0.5, 0.5)])
 def test_rows_that_scatter_more_are_averaged_and_have_an_honest_sigma(share, error_max_mm):
     camera = Camera(periods=16)
