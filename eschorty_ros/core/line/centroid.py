@@ -50,6 +50,8 @@ _HALF_SPAN = 2.5
 _LEARNED_OFF = 2.0
 _NONE = np.int64(0)
 _NO_WINDOW = Window(_NONE, _NONE, Sums(_NONE, _NONE, _NONE, _NONE, _NONE), np.int64(-1))
+# Widths that are separated for their median, per row.
+_WIDTHS_PER_ROW = 16
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _HALF_BIAS2 = 1.7519
 
@@ -96,12 +98,12 @@ class Rows(NamedTuple):
 
 
 class LineSums(NamedTuple):
-    """Pooled sum of squares of the rows used, with its degrees of freedom.
+    """Median width of the lines (standard deviation of the rows used), with degrees of freedom.
 
     ``events`` are those of the columns with a row, used or not; there are so many ``lines``.
     """
 
-    squares: float
+    width: float
     freedom: np.int64
     events: np.int64
     lines: np.int64
@@ -279,12 +281,13 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
 
 @kernel(_nrt=False)
-def _pooled(out, estimator):
-    """Return the sums over the rows used.
+def _pooled(out, estimator, counts):
+    """Return the sums over the rows used; ``counts`` is zeroed scratch.
 
-    Lines that are cut, and full columns with background, do not have the width of a line.
+    Lines that are cut, and full columns with background, do not have the width of a line. The
+    median leaves out two surfaces in one window, which would keep the windows of all so wide.
     """
-    squares, freedom, events, lines = 0.0, np.int64(0), np.int64(0), np.int64(0)
+    freedom, events, lines = np.int64(0), np.int64(0), np.int64(0)
     most = _BACKGROUND_FREE * estimator.line_variance
     windowed = _is_windowed(estimator.method)
     for k in range(out.row.shape[0]):
@@ -292,11 +295,18 @@ def _pooled(out, estimator):
             whole = out.events[k, c] > 0 and not out.truncated[k, c]
             if whole and (windowed or out.variance[k, c] <= most):
                 used = out.events[k, c] - 1
-                squares += out.variance[k, c] * used
+                width = np.int64(_WIDTHS_PER_ROW * np.sqrt(out.variance[k, c]))
+                counts[min(width, counts.size - 1)] += used
                 freedom += used
                 events += out.windows.column_events[k, c] if k == 0 else 0
                 lines += k == 0
-    return LineSums(squares, freedom, events, lines)
+    below, place = np.int64(0), 0
+    while 2 * (below + counts[place]) < freedom:
+        below += counts[place]
+        place += 1
+    within = (0.5 * freedom - below) / max(counts[place], 1)
+    counts[:] = 0
+    return LineSums((place + within) / _WIDTHS_PER_ROW, freedom, events, lines)
 
 
 @entry_kernel(_nrt=False)
@@ -373,5 +383,5 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             window, other = other, window
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)
-    line = _pooled(out, estimator)
+    line = _pooled(out, estimator, row_counts)
     return PeriodSums(line, few, ambiguous, two, unmodulated, events_unmodulated)

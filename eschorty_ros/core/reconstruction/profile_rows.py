@@ -256,7 +256,7 @@ def _forget_usual(widths, bursts):
 
 @kernel
 def _adapted_half(half, sums, half_max):
-    """Return the half width for the next period: 1.3 x the width of this one's rows, averaged.
+    """Return the half width for the next period: 1.3 x the width of this one's lines, averaged.
 
     It exceeds the limit where most events of the columns are in the windows, hence the line's, or
     where these are filled evenly, hence too narrow, in most columns: background has few rows.
@@ -264,7 +264,7 @@ def _adapted_half(half, sums, half_max):
     line = sums.line
     if line.freedom < _WIDTH_MIN_DOF:
         return half
-    measured = HALF_PER_SIGMA * np.sqrt(line.squares / line.freedom)
+    measured = HALF_PER_SIGMA * line.width
     filled = measured > _FILLED * half and line.lines > sums.too_few_events + sums.unmodulated
     wider = 3 * line.freedom > 2 * line.events or filled
     limit = half_max * (_WIDER if wider else 1)

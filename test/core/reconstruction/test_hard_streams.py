@@ -238,6 +238,16 @@ NO_LINE: dict[str, tuple[int, Callable[[Camera], Events], float]] = {
 }
 
 
+def test_two_surfaces_in_a_fifth_of_the_columns_do_not_widen_the_windows_of_all():
+    """As behind a pane of glass; windows that hold both give rows between them."""
+    camera = Camera(periods=24)
+    glass = camera.line(lambda k, c: np.where(c % 320 < 64, wavy(k, c) - 25.0, np.nan), power=0.5)
+    found, _ = points(camera, camera.line(wavy), glass)
+    found = found.select(found.period >= 8)
+    assert len(found) > 0.99 * 16 * CALIBRATION.columns, f"seed {camera.seed}"
+    assert np.mean(np.abs(error_px(found)) > 4.0) < 0.01
+
+
 @pytest.mark.parametrize("case", NO_LINE)
 def test_what_does_not_follow_the_laser_gives_no_points(case):
     periods, disturbance, limit = NO_LINE[case]
