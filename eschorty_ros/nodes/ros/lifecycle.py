@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 
 from eschorty_ros.core.base.errors import (
     ArgumentError,
@@ -58,11 +60,9 @@ class DeviceNode(LifecycleNode):
         **kwargs: Any,
     ) -> None:
         super().__init__(name, **kwargs)
-        if self.get_parameter("use_sim_time").value:
-            raise ArgumentError(
-                f"use_sim_time is true, but devices run in the host's time; leave it out for {name}"
-            )
+        self._check_time(self.get_parameter("use_sim_time").value)
         self.parameters = Parameters(self, (AUTO_START, *table), on_change)
+        self.add_on_set_parameters_callback(self._keep_time)
         self.failure = ""
         self.waiting = ""
         self._auto_starting = False
@@ -172,6 +172,23 @@ class DeviceNode(LifecycleNode):
         closed = self._attempt("error", self.safe_state)
         super().on_deactivate(state)
         return TransitionCallbackReturn.SUCCESS if closed else TransitionCallbackReturn.FAILURE
+
+    def _check_time(self, simulated: object) -> None:
+        if simulated:
+            raise ArgumentError(
+                "use_sim_time is true, but devices run in the host's time; "
+                f"leave it out for {self.get_name()}"
+            )
+
+    def _keep_time(self, proposed: Sequence[Parameter[Any]]) -> SetParametersResult:
+        """Refuse simulated time; called before rclpy's own callback, which would switch to it."""
+        try:
+            for parameter in proposed:
+                if parameter.name == "use_sim_time":
+                    self._check_time(parameter.value)
+        except ArgumentError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
     def _attempt(self, name: str, step: Callable[[], None]) -> bool:
         try:

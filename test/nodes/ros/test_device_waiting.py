@@ -2,11 +2,13 @@
 
 import functools
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.parameter import Parameter
 from ros_process import Observer, nodes_here, wait_until
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
@@ -61,6 +63,15 @@ def test_simulated_time_is_refused(observer) -> None:
         pytest.raises(ArgumentError, match=r"use_sim_time is true.* leave it out for instrument"),
     ):
         start(functools.partial(Instrument, Device(None)), use_sim_time=True)
+
+
+def test_simulated_time_is_refused_later_too(run) -> None:
+    node = run(None)
+    (answer,) = node.set_parameters([Parameter("use_sim_time", value=True)])
+    assert not answer.successful
+    assert "leave it out for instrument" in answer.reason
+    assert node.get_parameter("use_sim_time").value is False
+    assert abs(node.now_ns() - time.time_ns()) < 1e9
 
 
 def test_an_absent_device_is_retried_and_logged_once_per_reason(run, observer, capfd) -> None:
