@@ -41,14 +41,11 @@ class PhaseLock:
     Nothing is moved where ``on_edge_us`` is given or triggers come.
 
     - ``every``: See ``EdgeSchedule``.
-
-    Public attributes:
-    - ``missing``: True when the stream ended without a phase.
     """
 
     def __init__(self, modulation: Modulation, every: int) -> None:
         self.schedule = EdgeSchedule(modulation, every)
-        self.missing = False
+        self._ended = False
         self._modulation = modulation
         self._block = max(_BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
         self._block_end_us: int | None = None
@@ -68,6 +65,11 @@ class PhaseLock:
             "phase_corrections": self._corrections,
             "phase_relocks": self._relocks,
         }
+
+    @property
+    def missing(self) -> bool:
+        """Return whether the stream ended without a phase, and has none since."""
+        return self._ended and not self.schedule.anchored
 
     def find(self, held: HeldEvents, now_us: int, last: bool = False) -> bool:
         """Anchor the schedule as soon as the held events allow; return whether it is anchored.
@@ -106,7 +108,7 @@ class PhaseLock:
             estimate = estimate_phase(t, p, self._modulation)
             if estimate.found:
                 return self._anchor(estimate, first_us)
-            self.missing = True
+            self._ended = True
             held.refuse(len(held))
         return False
 

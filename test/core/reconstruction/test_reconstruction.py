@@ -369,6 +369,18 @@ def test_noise_before_the_laser_is_kept_back_and_the_phase_still_found():
     assert np.count_nonzero(found.t_us > 500_000) > 0.98 * 8 * 1280
 
 
+def test_a_phase_that_is_found_after_a_flush_without_one_has_no_warning():
+    """A scan in the dark before one with light."""
+    reconstructor = Reconstructor(CALIBRATION, Modulation(70.0))
+    reconstructor.push(encoded(sort_readout(*noise(3000, 80_000))))
+    reconstructor.flush()
+    assert reconstructor.phase_missing
+    found = reconstructor.push(encoded(lines(periods=8, edge_us=500_000)))
+    assert len(found) + len(reconstructor.flush()) > 0.8 * 8 * 1280
+    assert not reconstructor.phase_missing
+    assert not any("no modulation" in warning for warning in reconstructor.warnings)
+
+
 def test_events_without_a_phase_give_nothing_and_are_counted():
     n = 3000
     found, reconstructor = reconstruct(encoded(sort_readout(*noise(n, 80_000))), Modulation(70.0))
