@@ -219,6 +219,8 @@ class PacketStream:
         restarts then, unless ``epoch_ns`` gives it. An override goes before the modulation.
         """
         switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
+        # A new phase of light that goes on, as after a change of its frequency, is no new light.
+        new_light = on_since_ns is not None and self._on_since_ns is None
         if on_since_ns is None and self._on_since_ns is not None:
             self._warnings.end(self.warnings)
         self._on_since_ns = on_since_ns
@@ -226,7 +228,7 @@ class PacketStream:
         self._follow_laser(before)
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
-        if switched_on:
+        if new_light:
             self._warnings.restart(self._reconstructor)
         if self._recorder is not None and switched_on:
             self._recorder.laser_on()

@@ -731,7 +731,9 @@ def test_without_an_override_the_laser_counts_again_and_the_change_has_a_warning
     assert alone.waits_for == "modulation"
 
 
-def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning():
+@pytest.mark.parametrize("since_ns", [ZERO_NS, ZERO_NS + 1])
+def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning(since_ns):
+    """A generator of counted bursts begins a new phase with the change."""
     made = stream()
     made.announce_zero(ZERO_NS)
     epoch_ns = ZERO_NS + EDGE_US * 1000
@@ -739,10 +741,10 @@ def test_a_modulation_that_is_changed_while_it_is_on_has_a_warning():
     made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS)
     push(made, packets(line()))
     assert not [text for text in made.warnings if "changed" in text]
-    made.set_laser(Modulation(90.0), epoch_ns, on_since_ns=ZERO_NS)
+    made.set_laser(Modulation(90.0), epoch_ns, on_since_ns=since_ns)
     assert "the laser's modulation was changed while it was on" in made.warnings
     made.set_laser(MODULATION, epoch_ns, None)
-    made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS + 1)
+    made.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS + 2)
     assert not [text for text in made.warnings if "changed" in text]
 
 
