@@ -70,7 +70,7 @@ class ScanServices:
         self._recorder: ScanRecorder | None = None
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
-        self._refused: tuple[str, Any, float] = "", None, -math.inf
+        self._refused: tuple[Any, Any, float] = None, None, -math.inf
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
             (BeginScan, "reconstruction/begin_scan", self._on_begin),
@@ -100,12 +100,12 @@ class ScanServices:
 
     def _on_begin(self, request: Any, response: Any) -> Any:
         # A request that is repeated while the first one is refused must not begin the scan.
-        scan_id, refusal, at_s = self._refused
-        if request.scan_id == scan_id and time.monotonic() - at_s < RESEND_S:
+        refused, refusal, at_s = self._refused
+        if request == refused and time.monotonic() - at_s < RESEND_S:
             return refusal
         response = self._begin(request, response)
         if not response.success:
-            self._refused = request.scan_id, response, time.monotonic()
+            self._refused = request, response, time.monotonic()
         return response
 
     def _begin(self, request: Any, response: Any) -> Any:

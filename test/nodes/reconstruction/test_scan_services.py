@@ -1,5 +1,6 @@
 """The services around a scan of one's own camera and stage."""
 
+import math
 import time
 
 import pytest
@@ -27,8 +28,8 @@ def devices():
         yield observer, events, odometry
 
 
-def begin(observer, scan_id):
-    request = BeginScan.Request(scan_id=scan_id, stop=0.1)
+def begin(observer, scan_id, stop=0.1):
+    request = BeginScan.Request(scan_id=scan_id, stop=stop)
     return observer.call(BeginScan, "reconstruction/begin_scan", request)
 
 
@@ -56,6 +57,15 @@ def test_a_scan_begins_before_any_odometry_and_not_while_its_publisher_is_silent
     answer = begin(observer, "again")
     assert answer.success, answer.message
     end(observer, "again")
+
+
+def test_a_refused_request_that_was_corrected_begins_its_scan(devices):
+    observer, _, odometry = devices
+    odometry.publish(sample(observer))
+    assert "is not finite" in begin(observer, "corrected", math.inf).message
+    answer = begin(observer, "corrected")
+    assert answer.success, answer.message
+    end(observer, "corrected")
 
 
 def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
