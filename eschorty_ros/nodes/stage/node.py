@@ -34,6 +34,7 @@ _FEEDBACK_PERIOD_S = 0.05
 _POLL_S = 0.01
 # Longer than the 3 s between two heartbeats of DDS, so that lost messages can be repeated.
 _ODOM_DEPTH = 2000
+_INTERRUPTED = "move interrupted by shutdown"
 
 TABLE = (
     *drivers.DRIVER,
@@ -155,7 +156,8 @@ class StageNode(DeviceNode):
         try:
             return self._move_to_goal(goal)
         except EschortyError as error:
-            return self._aborted(goal, str(error))
+            # On its way out the device is closed under the move, whose own error says less.
+            return self._aborted(goal, _INTERRUPTED if ends(self) else str(error))
         finally:
             self._busy.release()
 
@@ -208,7 +210,7 @@ class StageNode(DeviceNode):
                 stopping = True
             if ends(self):
                 stage.stop()
-                raise DeviceError("move interrupted by shutdown")
+                raise DeviceError(_INTERRUPTED)
             if time.monotonic() - feedback_s >= _FEEDBACK_PERIOD_S:
                 feedback_s = time.monotonic()
                 feedback = MoveStage.Feedback(

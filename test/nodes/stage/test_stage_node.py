@@ -172,7 +172,9 @@ def test_a_refused_command_is_one_warning(stage: Stage) -> None:
     stage.emulated.stage.extra_bits = 0
 
 
-def test_interrupt_in_a_move_exits_clean(stage: Stage) -> None:
-    stage.start(0.0, 0.01)
+def test_interrupt_in_a_move_exits_clean_and_the_result_names_it(stage: Stage) -> None:
+    result = stage.start(0.0, 0.01).get_result_async()
     assert stage.process.interrupt() == 0
     assert "Traceback" not in stage.process.output
+    wait_until(result.done, "the move's end")
+    assert result.result().result.message == "move interrupted by shutdown"
