@@ -52,7 +52,7 @@ from eschorty_ros.nodes.ros.frames import frames
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, settings_of
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s, publishers_fault
-from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.spin import ends, run
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _STAGE_DEPTH = 2000
@@ -171,7 +171,7 @@ class ReconstructionNode(Node):
             callback_group=short,
             **override,
         )
-        Heartbeat(self, "reconstruction/heartbeat", self._running)
+        Heartbeat(self, "reconstruction/heartbeat", lambda: self._running() and not ends(self))
         self._scans = ScanServices(
             self,
             self._pipeline,

@@ -8,10 +8,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.srv import BeginScan, EndScan
 from event_camera_msgs.msg import EventPacket
 from nav_msgs.msg import Odometry
-from ros_process import NodeProcess, Observer
+from ros_process import NodeProcess, Observer, nodes_here
+from std_msgs.msg import Header
 from waiting import wait_until
 
+from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.spin import make_safe
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +88,13 @@ def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnosti
         "the reason in the diagnostics",
     )
     assert end(observer, "evt2").message == f"3 packets were refused, the last: {reason}"
+
+
+def test_a_reconstruction_on_its_way_out_reports_at_once_that_it_stops():
+    """Its process lives for seconds more, in which a scan's light must not stay on."""
+    with Observer() as observer, nodes_here(observer.domain) as start:
+        node = start(ReconstructionNode, frequency=70.0)
+        heartbeats = observer.collect(Header, "reconstruction/heartbeat", qos.heartbeat())
+        wait_until(lambda: heartbeats, "a heartbeat")
+        make_safe([node])
+        wait_until(lambda: heartbeats[-1].frame_id.endswith(" stopped"), "the report of the stop")
