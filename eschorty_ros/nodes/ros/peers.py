@@ -152,7 +152,8 @@ def publishers_fault(node: Node, topic: str) -> str:
         return ""
     if not names:
         return f"no publisher of {full}"
-    return f"{full} has {len(names)} publishers ({', '.join(names)[:100]}); stop all but one"
+    found = f"{full} has {len(names)} publishers ({', '.join(names)[:100]})"
+    return f"{found}; stop all but one, a killed one is listed for 20 s"
 
 
 def _living(node: Node, topic: str) -> set[bytes]:

@@ -71,6 +71,19 @@ def test_a_refused_request_that_was_corrected_begins_its_scan(devices):
     end(observer, "corrected")
 
 
+def test_a_second_publisher_is_refused_and_may_be_one_that_was_killed(devices):
+    observer, _, odometry = devices
+    odometry.publish(sample(observer))
+    second = observer.node.create_publisher(EventPacket, "camera/events", qos.events())
+    message = begin(observer, "two").message
+    observer.node.destroy_publisher(second)
+    assert message.startswith(
+        "/eschorty/camera/events has 2 publishers (observer, observer); stop all but one, a killed "
+        "one is listed for 20 s"
+    )
+    odometry.publish(sample(observer))
+
+
 def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
     observer, events, odometry = devices
     odometry.publish(sample(observer))
