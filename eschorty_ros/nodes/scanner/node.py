@@ -64,6 +64,8 @@ _FEEDBACK_S = 0.1
 _COUNT_CLIENTS_S = 0.5
 # A client that has just been discovered may not be counted yet.
 _CLIENT_TIMEOUT_S = 5.0
+# The next goal waits for the end of a canceled one.
+_CANCELED_S = 10.0
 # Time for the other nodes to start before a missing one is logged.
 _STARTING_S = 5.0
 
@@ -104,11 +106,11 @@ class ScannerNode(Node):
             Scan,
             "scan",
             execute_callback=self._execute,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
             callback_group=group,
         )
         diagnostics.Diagnostics(self, self._report, group)
-        self._own_goal = b""
+        self._own_goal = self._running_goal = self._canceled_goal = b""
         if self.parameters["auto_scan"]:
             self._self_client = ActionClient(self, Scan, "scan", callback_group=group)
             self._auto_timer = steady_timer(self, 0.1, self._auto_scan, group)
@@ -117,6 +119,10 @@ class ScannerNode(Node):
         """End a scan under way: on its way out the laser goes off and its heartbeat stops."""
         self._client.end()
         self._idle.wait(2.0)
+
+    def _on_cancel(self, goal: Any) -> CancelResponse:
+        self._canceled_goal = bytes(goal.goal_id.uuid)
+        return CancelResponse.ACCEPT
 
     def _execute(self, goal: Any) -> Any:
         values = goal.request
@@ -135,8 +141,10 @@ class ScannerNode(Node):
                 check_request(request, limits)
         except EschortyError as error:
             return self._refuse(goal, str(error))
-        if not self._one_scan.acquire(blocking=False):
+        ends_s = _CANCELED_S if self._canceled_goal == self._running_goal else 0.0
+        if not self._one_scan.acquire(timeout=ends_s):
             return self._refuse(goal, "a scan is running; wait for its end or cancel it")
+        self._running_goal = bytes(goal.goal_id.uuid)
         self._idle.clear()
         try:
             return self._scan(goal, request)
