@@ -268,17 +268,16 @@ class ReconstructionNode(Node):
         self._pipeline.set_capture(capture)
 
     def _scan_fault(self) -> tuple[str, bool]:
-        """Return why no scan can begin, ``""`` when one can, and whether it is the stage's topic.
+        """Return why no scan can begin, ``""`` when one can, and whether that may pass.
 
-        A stage that was killed counts as a publisher for some time.
+        A node that was killed counts as a publisher for some time.
         """
-        events, odometry = (
-            publishers_fault(self, topic) for topic in ("camera/events", "stage/odom")
-        )
-        laser = "" if self._override else publishers_fault(self, "laser/state")
+        topics = ["camera/events", "stage/odom", *([] if self._override else ["laser/state"])]
+        faults = [publishers_fault(self, topic) for topic in topics]
         silence = self._stage.silence_fault(self, "stage/odom")
-        faults = (events, odometry, laser, silence)
-        return "; ".join(fault for fault in faults if fault), bool(odometry or silence)
+        several = any(self.count_publishers(topic) > 1 for topic in topics)
+        message = "; ".join(fault for fault in (*faults, silence) if fault)
+        return message, several or bool(faults[1] or silence)
 
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")

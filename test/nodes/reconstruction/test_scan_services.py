@@ -75,9 +75,10 @@ def test_a_second_publisher_is_refused_and_may_be_one_that_was_killed(devices):
     observer, _, odometry = devices
     odometry.publish(sample(observer))
     second = observer.node.create_publisher(EventPacket, "camera/events", qos.events())
-    message = begin(observer, "two").message
+    answer = begin(observer, "two")
     observer.node.destroy_publisher(second)
-    assert message.startswith(
+    assert answer.retry
+    assert answer.message.startswith(
         "/eschorty/camera/events has 2 publishers (observer, observer); stop all but one, a killed "
         "one is listed for 20 s"
     )
