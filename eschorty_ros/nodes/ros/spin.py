@@ -13,6 +13,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
@@ -39,6 +40,10 @@ _SIGNALS_MAX = 64
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ending: WeakSet[Node] = WeakSet()
 _REASON_MAX = 240
+_HELP = """
+It is a ROS 2 node, which runs until Ctrl-C. Names and parameters follow --ros-args:
+  {0} --ros-args -r __ns:=/eschorty -p NAME:=VALUE --params-file FILE
+docs/interfaces.md lists them, and `ros2 param describe` of a running node."""
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
@@ -131,12 +136,18 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
 
     - ``factories``: Each makes one node in the context.
     - ``threads``: Threads of the executor; more than one where a callback waits (actions).
-    - ``args``: Command line; that of the process when omitted.
+    - ``args``: Command line; that of the process when omitted. ``--help`` starts nothing.
 
     Returns 0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its
     name runs, or a timer raised an ``EschortyError`` (one line). The process ends with 1
     where DDS does not answer any more.
     """
+    words = sys.argv[1:] if args is None else args
+    if "--help" in words or "-h" in words:
+        for factory in factories:
+            print(sys.modules[getattr(factory, "func", factory).__module__].__doc__)
+        print(_HELP.format(Path(sys.argv[0]).name))
+        return 0
     nodes: list[Node] = []
     second: SecondNodes | None = None
     spinning: Spinning | None = None

@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import rclpy
 from ros_process import NodeProcess, Observer, domain_environment, wait_until
 
 from eschorty_ros.hardware.base.launcher import VARIABLE
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.scanner.node import ScannerNode
 
 LASER, SCANNER = "eschorty_ros.nodes.laser.node", "eschorty_ros.nodes.scanner.node"
 IDLE = {"auto_start": False}
@@ -67,6 +70,14 @@ def test_a_node_ends_when_its_launcher_is_killed(tmp_path: Path, early: bool) ->
         launcher.communicate()
         wait_until(lambda: not Path(f"/proc/{pid}").exists(), "the end of the node")
     assert log.read_text() == ""
+
+
+def test_help_says_how_names_and_parameters_are_given_and_starts_nothing(capsys) -> None:
+    assert run(ScannerNode, args=["--help"]) == 0
+    output = capsys.readouterr().out
+    assert output.startswith("Node ``scanner``: the ``scan`` action")
+    assert "--ros-args -r __ns:=/eschorty -p NAME:=VALUE" in output
+    assert not rclpy.ok()
 
 
 @pytest.mark.parametrize(
