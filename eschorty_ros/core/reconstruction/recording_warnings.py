@@ -116,6 +116,8 @@ def recording_warnings(
         )
     samples = recording.stage_samples
     found += stage_faults(recording, span_us)
+    if len(points):
+        found += _sampling_faults(recording, span_us, float(np.median(points["sigma"])) * 1e3)
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
@@ -231,6 +233,32 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"{name} is missing: copy it again"
         )
     return found
+
+
+def _sampling_faults(recording: Recording, span_us: tuple[int, int], sigma_mm: float) -> list[str]:
+    """Return a line where positions between the samples are off by more than ``sigma_mm``.
+
+    Half-way in an interval h a constant acceleration a moves the stage by a h^2 / 8 from the line
+    between two samples, and a is the change of speed from interval to interval over their time.
+    """
+    t_us, position_mm = (recording.stage_samples[name] for name in ("t_us", "position_mm"))
+    interval_s = np.diff(t_us) * 1e-6
+    speed_mm_s = np.diff(position_mm) / interval_s
+    pair_s = 0.5 * (interval_s[1:] + interval_s[:-1])
+    longer_s = np.maximum(interval_s[1:], interval_s[:-1])
+    off_mm = np.abs(np.diff(speed_mm_s)) / pair_s * longer_s**2 / 8.0
+    inside = (t_us >= span_us[0]) & (t_us <= span_us[1])
+    if (scan := recording.scan) is not None:
+        inside &= between(position_mm, scan.start_mm, scan.stop_mm)
+    off_mm = np.where(inside[1:-1], off_mm, 0.0)
+    if not off_mm.size or off_mm.max() <= sigma_mm or _jump(t_us, position_mm) is not None:
+        return []
+    worst = int(np.argmax(off_mm))
+    return [
+        f"the speed in stage.csv changes by {abs(speed_mm_s[worst + 1] - speed_mm_s[worst]):.3g} "
+        f"mm/s at {t_us[worst + 1] * 1e-6:.3f} s from one sample to the next, so that positions "
+        f"between them may be off by {off_mm[worst]:.2g} mm; log them more often"
+    ]
 
 
 def _jump(t_us: NDArray[np.int64], position_mm: NDArray[np.float64]) -> int | None:

@@ -50,6 +50,13 @@ def with_stage(recording, later_us, part=slice(None), scale=1.0):
     return replace(recording, stage=track, stage_samples=samples)
 
 
+def with_waves(recording):
+    """The stage wobbles by 2 mm, as its log shows six times in each turn."""
+    samples = recording.stage_samples[::5].copy()
+    samples["position_mm"] += 2.0 * np.sin(np.arange(samples.size))
+    return with_stage(replace(recording, stage_samples=samples), 0)
+
+
 def with_half_of_the_events(recording, half=0):
     data = recording.events_path.read_bytes()
     begin = data.index(b"% end\n") + 6
@@ -180,6 +187,7 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
         (lambda r: with_half_of_the_events(r), {}, "mm after that; where these were scanned", 1),
         (lambda r: with_stage(r, 0, scale=1e-3), {}, "moves by 0.03 mm in stage.csv; where", 1),
         (lambda r: with_half_of_the_events(r, 1), {}, "mm before; where these were scanned", 1),
+        (lambda r: with_waves(r), {}, "positions between them may be off by", 1),
         (lambda r: with_stage_at(r, 20.0), {}, "the stage stays at 20 mm in stage.csv", 1),
         (lambda r: with_stage_at(r, 180.0, 40), {}, "to 180 mm at 0.400 s in stage.csv; remove", 1),
         (lambda r: with_stage_at(r, 29.0, 40), {}, "to 29 mm at 0.400 s in stage.csv; remove", 1),
