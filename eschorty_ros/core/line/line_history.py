@@ -12,7 +12,8 @@ Minus their mean product is the variance of the jumps; a steady displacement has
 
 A line that gets narrower or wider for a few profiles passes an edge, and is off by half of the rows
 that are missing, or new, at most. Means over blocks show changes that are too small to be seen in a
-column.
+column. Stripes change the mean width of recent profiles, too: the last width that was steady shows
+their edges.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
+# A width is the same where it changes by two standard deviations of two at most, squared, and
+# steady when it was so for half of the recent profiles: an edge passes in fewer, or slowly.
+_UNCHANGED2, _STEADY_PROFILES = 8.0, 0.5 * RECENT_PROFILES
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)
@@ -53,7 +57,8 @@ class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
-    ``jitter2`` the mean of minus the products of successive differences.
+    ``jitter2`` the mean of minus the products of successive differences. The ``last_width`` has
+    been the same for ``unchanged`` profiles; ``steady_width`` is the last that was for some.
     """
 
     row: NDArray[np.float64]
@@ -62,6 +67,9 @@ class BlockMeans(NamedTuple):
     last: NDArray[np.float64]
     difference: NDArray[np.float64]
     jitter2: NDArray[np.float64]
+    last_width: NDArray[np.float64]
+    steady_width: NDArray[np.float64]
+    unchanged: NDArray[np.float64]
 
 
 class PolarityMeans(NamedTuple):
@@ -105,7 +113,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((6, blocks)))
+    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((9, blocks)))
     polarities = PolarityMeans(*np.zeros((5, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(
@@ -164,10 +172,28 @@ def _has_one_polarity(polarities, block):
 
 
 @kernel(_nrt=False)
+def _changed_since_steady(recent, block, width, width2):
+    """Return by how much the width differs from the last one that was the same for some profiles.
+
+    ``width2`` is the variance of a block's mean width.
+    """
+    change = width - recent.last_width[block]
+    recent.last_width[block] = width
+    if change * change > _UNCHANGED2 * width2:
+        recent.unchanged[block] = 0.0
+    else:
+        recent.unchanged[block] += 1.0
+        if recent.unchanged[block] >= _STEADY_PROFILES:
+            recent.steady_width[block] = width
+    return abs(width - recent.steady_width[block]) if recent.steady_width[block] > 0.0 else 0.0
+
+
+@kernel(_nrt=False)
 def _compare_with_recent(history, known, usual, width_variance):
     """Compare the sums of a profile with recent profiles, and add them.
 
-    A line that has its ``usual`` width again, where it is ``known``, has passed the edge.
+    A line that has its ``usual`` width again for some profiles, where it is ``known``, has passed
+    the edge.
     """
     now, recent, polarities = history.now, history.recent, history.polarities
     for block in range(1, now.points.size - 1):
@@ -181,8 +207,9 @@ def _compare_with_recent(history, known, usual, width_variance):
         own2 = _near_sum(now.sigma2, block) / (points * points)
         moved2 = moved * moved - own2
         least, most = min(recent.width[block], usual), max(recent.width[block], usual)
-        changed = max(least - width, width - most, 0.0) if known else 0.0
         width2 = width_variance / points
+        since_steady = _changed_since_steady(recent, block, width, width2)
+        changed = max(least - width, width - most, since_steady) if known else 0.0
         passing2 = PER_WIDTH**2 * (changed * changed - width2)
         profiles = min(profiles + 1.0, RECENT_PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.

@@ -75,7 +75,8 @@ class Widths(NamedTuple):
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
     ``static_width`` less what motion adds, ``last`` and ``last_row`` widths and rows of the last
-    one. The ``history`` has what changes.
+    one, ``steady`` the last widths that did not change from one profile to the next. The
+    ``history`` has what changes.
     """
 
     usual: UsualWidths
@@ -84,15 +85,18 @@ class Widths(NamedTuple):
     static_width: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
+    steady: NDArray[np.float64]
     history: LineHistory
 
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, static_width, last, last_row = np.full((4, returns, columns), np.nan)
+    smoothed, static_width, last, last_row, steady = np.full((5, returns, columns), np.nan)
     history = empty_history(columns, common_px, windowed)
     below = np.zeros(_BINS + 1)
-    return Widths(empty_usual_widths(), below, smoothed, static_width, last, last_row, history)
+    return Widths(
+        empty_usual_widths(), below, smoothed, static_width, last, last_row, steady, history
+    )
 
 
 def empty_usual_widths() -> UsualWidths:
@@ -135,9 +139,10 @@ def _restart_widths(widths, known):
     usual, history = widths.usual, widths.history
     recent, polarities = history.recent, history.polarities
     usual.number[:], usual.median.difference = known.number, known.median.difference
-    widths.last[:], widths.last_row[:] = np.nan, np.nan
+    widths.last[:], widths.last_row[:], widths.steady[:] = np.nan, np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
-    recent.jitter2[:] = 0.0
+    recent.jitter2[:], recent.last_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
+    recent.unchanged[:] = 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
@@ -272,6 +277,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
     smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
+    steady_width = widths.steady
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
@@ -302,9 +308,14 @@ def _mark_unusual(rows, smoothing, lit_share):
             if mixed2 > 0.0:
                 rows.mixed[k, c] = True
                 more2 = max(more2, mixed2)
-            sigma2[k, c] += more2
             if not abs(width - last[k, c]) > _STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
+                steady_width[k, c] = width
+            elif known and not np.isnan(steady_width[k, c]):
+                changed2 = (PER_WIDTH * (width - steady_width[k, c])) ** 2
+                rows.mixed[k, c] |= changed2 > _MARKED**2 * rows.sigma2[k, c]
+                more2 = max(more2, changed2)
+            sigma2[k, c] += more2
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
