@@ -37,8 +37,8 @@ RECENT_PROFILES = 16.0
 # than what its rows scatter.
 _FAST_PX = 0.5
 # A width is the same where it changes by two standard deviations of two at most, squared, and
-# steady when it was so for half of the recent profiles: an edge passes in fewer, or slowly.
-_UNCHANGED2, _STEADY_PROFILES = 8.0, 0.5 * RECENT_PROFILES
+# steady when it was so for a quarter of the recent profiles.
+_UNCHANGED2, _STEADY_PROFILES = 8.0, 0.25 * RECENT_PROFILES
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)
@@ -58,7 +58,8 @@ class BlockMeans(NamedTuple):
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
     ``jitter2`` the mean of minus the products of successive differences. The ``last_width`` has
-    been the same for ``unchanged`` profiles; ``steady_width`` is the last that was for some.
+    been the same for ``unchanged`` profiles; ``steady_width``, of ``before`` profiles ago, is the
+    last that was for some.
     """
 
     row: NDArray[np.float64]
@@ -70,6 +71,7 @@ class BlockMeans(NamedTuple):
     last_width: NDArray[np.float64]
     steady_width: NDArray[np.float64]
     unchanged: NDArray[np.float64]
+    before: NDArray[np.float64]
 
 
 class PolarityMeans(NamedTuple):
@@ -113,7 +115,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((9, blocks)))
+    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((10, blocks)))
     polarities = PolarityMeans(*np.zeros((5, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(
@@ -179,13 +181,13 @@ def _changed_since_steady(recent, block, width, width2):
     """
     change = width - recent.last_width[block]
     recent.last_width[block] = width
-    if change * change > _UNCHANGED2 * width2:
-        recent.unchanged[block] = 0.0
-    else:
-        recent.unchanged[block] += 1.0
-        if recent.unchanged[block] >= _STEADY_PROFILES:
-            recent.steady_width[block] = width
-    return abs(width - recent.steady_width[block]) if recent.steady_width[block] > 0.0 else 0.0
+    same = not change * change > _UNCHANGED2 * width2
+    recent.unchanged[block] = recent.unchanged[block] + 1.0 if same else 0.0
+    recent.before[block] += 1.0
+    if recent.unchanged[block] >= _STEADY_PROFILES:
+        recent.steady_width[block], recent.before[block] = width, 0.0
+    known = recent.steady_width[block] > 0.0 and recent.before[block] <= RECENT_PROFILES
+    return abs(width - recent.steady_width[block]) if known else 0.0
 
 
 @kernel(_nrt=False)

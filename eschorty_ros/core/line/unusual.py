@@ -142,7 +142,7 @@ def _restart_widths(widths, known):
     widths.last[:], widths.last_row[:], widths.steady[:] = np.nan, np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     recent.jitter2[:], recent.last_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
-    recent.unchanged[:] = 0.0
+    recent.unchanged[:], recent.before[:] = 0.0, 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
@@ -311,7 +311,7 @@ def _mark_unusual(rows, smoothing, lit_share):
             if not abs(width - last[k, c]) > _STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
                 steady_width[k, c] = width
-            elif known and not np.isnan(steady_width[k, c]):
+            elif known and abs(width - usual) > _STEADY * sigma and steady_width[k, c] > 0.0:
                 changed2 = (PER_WIDTH * (width - steady_width[k, c])) ** 2
                 rows.mixed[k, c] |= changed2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, changed2)
