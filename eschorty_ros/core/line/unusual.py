@@ -1,11 +1,10 @@
-"""Points whose line is narrower or wider than the lines of its stream or beside it.
-
-They are on two surfaces.
+"""Points on two surfaces: their line is narrower or wider than those of the stream, or beside it.
 
 An edge of range or reflectance within the line's thickness leaves a part of the line, or two parts
 side by side, and moves the row by up to half of the change of the full width. A width is unusual
 when few lines of the stream have it for longer than a profile: the width of a line that a step
-crosses changes, that on a dark surface stays.
+crosses changes, that on a dark surface stays. Where stripes make all widths usual, one that changes
+from profile to profile is compared with the last that did not.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
