@@ -36,9 +36,10 @@ RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
-# A width is the same where it changes by two standard deviations of two at most, squared, and
-# steady when it was so for a quarter of the recent profiles.
-_UNCHANGED2, _STEADY_PROFILES = 8.0, 0.25 * RECENT_PROFILES
+# A width or row is steady when it changes by so many deviations at most, the mean width of a block
+# when it does so for a quarter of the recent profiles.
+STEADY = 2.0 * np.sqrt(2.0)
+_STEADY_PROFILES = 0.25 * RECENT_PROFILES
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)
@@ -181,7 +182,7 @@ def _changed_since_steady(recent, block, width, width2):
     """
     change = width - recent.last_width[block]
     recent.last_width[block] = width
-    same = not change * change > _UNCHANGED2 * width2
+    same = not change * change > STEADY**2 * width2
     recent.unchanged[block] = recent.unchanged[block] + 1.0 if same else 0.0
     recent.before[block] += 1.0
     if recent.unchanged[block] >= _STEADY_PROFILES:

@@ -22,6 +22,7 @@ from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.line_history import (
     PER_WIDTH,
+    STEADY,
     LineHistory,
     _compare_with_recent,
     empty_history,
@@ -39,8 +40,6 @@ _USUAL_SHARE = 0.02
 _MIXED_WEIGHT = 0.25
 # The same where the row moves.
 _MOVING_WEIGHT = 0.05
-# A width or row is steady when it changes by so many deviations at most.
-_STEADY = 2.0 * np.sqrt(2.0)
 # Points without which no width is usual.
 _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
@@ -189,7 +188,7 @@ def _mixed_variance(rows, smoothing, k, c, sigma_width):
     if not mixed2 > _MARKED**2 * rows.sigma2[k, c]:
         return 0.0
     beside, variance = max(smoothed[k, left], smoothed[k, right]), rows.variance[k, c]
-    wider = np.sqrt(variance) - beside > _STEADY * sigma_width
+    wider = np.sqrt(variance) - beside > STEADY * sigma_width
     return mixed2 if wider and 2.0 * (variance - beside * beside) > mixed2 else 0.0
 
 
@@ -298,7 +297,7 @@ def _mark_unusual(rows, smoothing, lit_share):
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths.below, width, reach):
-                steady = not displacement * displacement > _STEADY**2 * row2
+                steady = not displacement * displacement > STEADY**2 * row2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
@@ -307,10 +306,10 @@ def _mark_unusual(rows, smoothing, lit_share):
             if mixed2 > 0.0:
                 rows.mixed[k, c] = True
                 more2 = max(more2, mixed2)
-            if not abs(width - last[k, c]) > _STEADY * sigma:
+            if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
                 steady_width[k, c] = width
-            elif known and abs(width - usual) > _STEADY * sigma and steady_width[k, c] > 0.0:
+            elif known and abs(width - usual) > STEADY * sigma and steady_width[k, c] > 0.0:
                 changed2 = (PER_WIDTH * (width - steady_width[k, c])) ** 2
                 rows.mixed[k, c] |= changed2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, changed2)
