@@ -36,10 +36,10 @@ RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
-# A width or row is steady when it changes by so many deviations at most, the mean width of a block
-# when it does so for a quarter of the recent profiles.
+# A width or row is the same while it changes by so many deviations at most, and steady when it has
+# been so for more than a quarter of the recent profiles.
 STEADY = 2.0 * np.sqrt(2.0)
-_STEADY_PROFILES = 0.25 * RECENT_PROFILES
+STEADY_PROFILES = 0.25 * RECENT_PROFILES
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)
@@ -58,9 +58,9 @@ class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
-    ``jitter2`` the mean of minus the products of successive differences. The ``last_width`` has
-    been the same for ``unchanged`` profiles; ``steady_width``, of ``before`` profiles ago, is the
-    last that was for some.
+    ``jitter2`` the mean of minus the products of successive differences. The ``same_width`` has
+    been the same for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last
+    that was for some.
     """
 
     row: NDArray[np.float64]
@@ -69,9 +69,9 @@ class BlockMeans(NamedTuple):
     last: NDArray[np.float64]
     difference: NDArray[np.float64]
     jitter2: NDArray[np.float64]
-    last_width: NDArray[np.float64]
+    same_width: NDArray[np.float64]
     steady_width: NDArray[np.float64]
-    unchanged: NDArray[np.float64]
+    same: NDArray[np.float64]
     before: NDArray[np.float64]
 
 
@@ -174,19 +174,29 @@ def _has_one_polarity(polarities, block):
     return _near_sum(polarities.all_columns, block) == 0.0
 
 
+@kernel
+def _same_for(width, mean, profiles, sigma):
+    """Return the mean of the widths that are the same, this one included, and their number.
+
+    Their ``mean`` so far is compared: a width that changes slowly is not the same for long.
+    """
+    if not abs(width - mean) <= STEADY * sigma:
+        return width, 1.0
+    return mean + (width - mean) / (profiles + 1.0), profiles + 1.0
+
+
 @kernel(_nrt=False)
 def _changed_since_steady(recent, block, width, width2):
     """Return by how much the width differs from the last one that was the same for some profiles.
 
     ``width2`` is the variance of a block's mean width.
     """
-    change = width - recent.last_width[block]
-    recent.last_width[block] = width
-    same = not change * change > STEADY**2 * width2
-    recent.unchanged[block] = recent.unchanged[block] + 1.0 if same else 0.0
+    recent.same_width[block], recent.same[block] = _same_for(
+        width, recent.same_width[block], recent.same[block], np.sqrt(width2)
+    )
     recent.before[block] += 1.0
-    if recent.unchanged[block] >= _STEADY_PROFILES:
-        recent.steady_width[block], recent.before[block] = width, 0.0
+    if recent.same[block] > STEADY_PROFILES:
+        recent.steady_width[block], recent.before[block] = recent.same_width[block], 0.0
     known = recent.steady_width[block] > 0.0 and recent.before[block] <= RECENT_PROFILES
     return abs(width - recent.steady_width[block]) if known else 0.0
 

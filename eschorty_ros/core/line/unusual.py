@@ -3,8 +3,8 @@
 An edge of range or reflectance within the line's thickness leaves a part of the line, or two parts
 side by side, and moves the row by up to half of the change of the full width. A width is unusual
 when few lines of the stream have it for longer than a profile: the width of a line that a step
-crosses changes, that on a dark surface stays. Where stripes make all widths usual, one that changes
-from profile to profile is compared with the last that did not.
+crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
+one that changes is compared with the last that did not, or with the median of all.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
@@ -23,8 +23,10 @@ from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.line_history import (
     PER_WIDTH,
     STEADY,
+    STEADY_PROFILES,
     LineHistory,
     _compare_with_recent,
+    _same_for,
     empty_history,
 )
 from eschorty_ros.core.line.reflectance import ROOT_12
@@ -72,16 +74,17 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``static_width`` less what motion adds, ``last`` and ``last_row`` widths and rows of the last
-    one, ``steady`` the last widths that did not change from one profile to the next. The
-    ``history`` has what changes.
+    ``static_width`` less what motion adds, ``last_row`` the rows of the last one. The
+    ``same_width`` has been the same for ``same`` profiles; ``steady`` is the last that was for
+    some. The ``history`` has what changes.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
     smoothed: NDArray[np.float64]
     static_width: NDArray[np.float64]
-    last: NDArray[np.float64]
+    same_width: NDArray[np.float64]
+    same: NDArray[np.float64]
     last_row: NDArray[np.float64]
     steady: NDArray[np.float64]
     history: LineHistory
@@ -89,11 +92,17 @@ class Widths(NamedTuple):
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, static_width, last, last_row, steady = np.full((5, returns, columns), np.nan)
-    history = empty_history(columns, common_px, windowed)
-    below = np.zeros(_BINS + 1)
+    smoothed, static_width, same_width, last_row, steady = np.full((5, returns, columns), np.nan)
     return Widths(
-        empty_usual_widths(), below, smoothed, static_width, last, last_row, steady, history
+        usual=empty_usual_widths(),
+        below=np.zeros(_BINS + 1),
+        smoothed=smoothed,
+        static_width=static_width,
+        same_width=same_width,
+        same=np.zeros((returns, columns)),
+        last_row=last_row,
+        steady=steady,
+        history=empty_history(columns, common_px, windowed),
     )
 
 
@@ -137,10 +146,10 @@ def _restart_widths(widths, known):
     usual, history = widths.usual, widths.history
     recent, polarities = history.recent, history.polarities
     usual.number[:], usual.median.difference = known.number, known.median.difference
-    widths.last[:], widths.last_row[:], widths.steady[:] = np.nan, np.nan, np.nan
+    widths.same_width[:], widths.last_row[:], widths.steady[:] = np.nan, np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
-    recent.jitter2[:], recent.last_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
-    recent.unchanged[:], recent.before[:] = 0.0, 0.0
+    recent.jitter2[:], recent.same_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
+    recent.same[:], recent.before[:] = 0.0, 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
@@ -274,8 +283,8 @@ def _mark_unusual(rows, smoothing, lit_share):
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
-    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
-    steady_width = widths.steady
+    smoothed, last_row = widths.smoothed, widths.last_row
+    same_width, same = widths.same_width, widths.same
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
@@ -290,6 +299,7 @@ def _mark_unusual(rows, smoothing, lit_share):
             rows.mixed[k, c] = False
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
+                same_width[k, c] = np.nan
                 continue
             weight, more2 = 1.0, widths.history.passing2[c // BLOCK_COLUMNS + 1]
             if smoothing.used[k, c] != averaged:
@@ -306,11 +316,14 @@ def _mark_unusual(rows, smoothing, lit_share):
             if mixed2 > 0.0:
                 rows.mixed[k, c] = True
                 more2 = max(more2, mixed2)
-            if not abs(width - last[k, c]) > STEADY * sigma:
+            same_width[k, c], same[k, c] = _same_for(width, same_width[k, c], same[k, c], sigma)
+            if same[k, c] > 1.0:
                 widths.usual.number[_width_bin(width)] += weight
-                steady_width[k, c] = width
-            elif known and abs(width - usual) > STEADY * sigma and steady_width[k, c] > 0.0:
-                changed2 = (PER_WIDTH * (width - steady_width[k, c])) ** 2
+            if same[k, c] > STEADY_PROFILES:
+                widths.steady[k, c] = same_width[k, c]
+            elif known and abs(width - usual) > STEADY * sigma:
+                before = usual if np.isnan(widths.steady[k, c]) else widths.steady[k, c]
+                changed2 = (PER_WIDTH * (width - before)) ** 2
                 rows.mixed[k, c] |= changed2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, changed2)
             sigma2[k, c] += more2
@@ -319,6 +332,6 @@ def _mark_unusual(rows, smoothing, lit_share):
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            last[k, c], last_row[k, c] = widths.static_width[k, c], row[k, c]
+            last_row[k, c] = row[k, c]
     widths.usual.median.difference = median
     _update(widths, columns)

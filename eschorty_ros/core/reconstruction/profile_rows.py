@@ -52,7 +52,11 @@ from eschorty_ros.core.line.learned_gate import (
     _use_late,
     make_gate,
 )
-from eschorty_ros.core.line.line_history import _compare_polarities, _mean_step_px
+from eschorty_ros.core.line.line_history import (
+    RECENT_PROFILES,
+    _compare_polarities,
+    _mean_step_px,
+)
 from eschorty_ros.core.line.scatter import (
     FACTOR_MAX,
     Scatter,
@@ -90,6 +94,7 @@ While the sensor's edge cuts a line learning goes on.
 # Profiles of the first window, as full of points as any, that show the usual widths.
 _KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
+_RECENT = np.int64(RECENT_PROFILES)
 _WIDTH_MIN_DOF = 64
 # Times the limit that a line may be wide, and from which on that is a fault.
 _WIDER, _TOO_WIDE = 4, 1.5
@@ -127,9 +132,10 @@ CLOSED, EMPTY, FILLED = 0, 1, 2
 # more room, ``window`` and ``profiles`` the numbers of events and profiles since the estimate
 # started, ``over`` 1 where a pass ended with it. ``points`` are those since the restart,
 # ``points_most`` the most of a profile, ``known_half`` is 0 until windows begin with what is known.
+# ``recent_points`` and ``recent_events`` are sums over recent profiles.
 _STATE = (
     "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "profiles", "over",
-    "points", "points_most", "known_half",
+    "points", "points_most", "known_half", "recent_points", "recent_events",
 )  # fmt: skip
 
 
@@ -231,7 +237,7 @@ def first_choice(settings: Settings) -> int:
 def _begin_window(memory):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
     state = memory.state
-    state.window = state.profiles = 0
+    state.window = state.profiles = state.recent_points = state.recent_events = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:], memory.columns.events[:] = -1, 0
@@ -272,16 +278,21 @@ def _adapted_half(half, sums, half_max):
 
 
 @kernel(_nrt=False)
-def _few_events(rows, most):
-    """Return the number below which a point's events are few: half of the mean, up to ``most``."""
-    total, points = 0.0, 0
+def _few_events(rows, most, state):
+    """Return the number below which a point's events are few: half of the mean, up to ``most``.
+
+    The mean is over recent profiles, since all of the first line on a surface has few events.
+    """
+    events, points = np.int64(0), np.int64(0)
     returns, columns = rows.row.shape
     for k in range(returns):
         for c in range(columns):
             if not np.isnan(rows.row[k, c]):
-                total += rows.events[k, c]
+                events += rows.events[k, c]
                 points += 1
-    return min(0.5 * total / max(points, 1), float(most))
+    state.recent_events += events - state.recent_events // _RECENT
+    state.recent_points += points - state.recent_points // _RECENT
+    return min(0.5 * state.recent_events / max(state.recent_points, 1), float(most))
 
 
 @kernel(_nrt=False)
@@ -416,7 +427,7 @@ def _close(memory):
     counters.points_burst_shift += followed.shifted
     counters.points_one_polarity += followed.of_one_polarity
     _learn_line(memory, half, learns, late)
-    few = _few_events(rows, smoothing.isolation_events)
+    few = _few_events(rows, smoothing.isolation_events, state)
     delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)

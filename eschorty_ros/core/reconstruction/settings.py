@@ -122,7 +122,7 @@ class Settings:
     isolation_events: int = _number(
         10, 0, 1000, "events",
         "points with fewer need a neighbour, see isolation_gate_px; with less than half of the "
-        "profile's mean, too, they have the flag few_events",
+        "mean of recent profiles, too, they have the flag few_events",
     )  # fmt: skip
     reflectance: str = _choice(
         "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"

@@ -73,6 +73,32 @@ def test_sigma_holds_what_the_edges_of_stripes_move():
     assert within[~edge].mean() > 0.9
 
 
+@pytest.mark.parametrize(
+    ("speed_px", "pitch", "least", "most"), [(2.0, 30, 0.95, 0.01), (0.7, 60, 0.7, 0.3)]
+)
+def test_lines_that_appear_and_vanish_are_flagged(speed_px, pitch, least, most):
+    """Surfaces with nothing between, half of the points at an edge: all widths are usual."""
+    camera = Camera(periods=4 * pitch + 80)
+
+    def part(k):
+        # What is ahead of the surface's first edge or behind its last one is not lit.
+        return speed_px * (0.25 * pitch - k % pitch), speed_px * (0.75 * pitch - k % pitch)
+
+    found, _ = reconstruct(
+        stream(camera.line(lambda _, column: np.full(column.shape, ROW), part=part))
+    )
+    found = found.select(found.period >= 2 * pitch)
+    error_px, flagged = np.abs(found.row - ROW), found.flags > 0
+    bad, good = error_px > 1.5, error_px < 0.3
+    print(
+        f"{bad.mean():.2f} of {bad.size} points are wrong; {flagged[bad].mean():.2f} of these and "
+        f"{flagged[good].mean():.3f} of the good ones are flagged, seed {camera.seed}"
+    )
+    # 0.69 and 0.42 where steady widths change slowly and few events are those of a profile.
+    assert flagged[bad].mean() > least
+    assert flagged[good].mean() < most
+
+
 @pytest.mark.parametrize("step_px", [-0.5, 0.5], ids=["wider", "narrower"])
 def test_sigma_holds_what_an_edge_too_small_for_a_flag_moves(step_px):
     """A step of half a row passes from one end of the line to the other in 20 profiles."""
