@@ -277,6 +277,24 @@ def _moved_median(median, value, values):
     return above if value > median else below
 
 
+@kernel
+def _changed_variance(widths, known, k, c, sigma_width):
+    """Return the variance of a row whose line has changed its width, px squared.
+
+    It is 0 where the width is steady, or the usual one.
+    """
+    width, usual = widths.static_width[k, c], widths.usual.median.width
+    same_width, same = widths.same_width, widths.same
+    same_width[k, c], same[k, c] = _same_for(width, same_width[k, c], same[k, c], sigma_width)
+    if same[k, c] > STEADY_PROFILES:
+        widths.steady[k, c] = same_width[k, c]
+        return 0.0
+    if not known or abs(width - usual) <= STEADY * sigma_width:
+        return 0.0
+    before = usual if np.isnan(widths.steady[k, c]) else widths.steady[k, c]
+    return (PER_WIDTH * (width - before)) ** 2
+
+
 @kernel(_nrt=False)
 def _mark_unusual(rows, smoothing, lit_share):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
@@ -284,7 +302,6 @@ def _mark_unusual(rows, smoothing, lit_share):
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
     smoothed, last_row = widths.smoothed, widths.last_row
-    same_width, same = widths.same_width, widths.same
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
@@ -294,39 +311,35 @@ def _mark_unusual(rows, smoothing, lit_share):
     for k in range(returns):
         for c in range(columns):
             width, displacement = widths.static_width[k, c], row[k, c] - last_row[k, c]
-            row2 = sigma2[k, c]
+            row2, limit2 = sigma2[k, c], _MARKED**2 * rows.sigma2[k, c]
             sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
-            weak = rows.events[k, c] < smoothing.isolation_events
-            if np.isnan(width) or rows.truncated[k, c] or weak:
-                same_width[k, c] = np.nan
+            if np.isnan(width) or rows.truncated[k, c]:
+                widths.same_width[k, c] = np.nan
                 continue
-            weight, more2 = 1.0, widths.history.passing2[c // BLOCK_COLUMNS + 1]
+            events = rows.events[k, c]
+            if events < smoothing.isolation_events:
+                # The width of few events scatters by more than those of most lines.
+                sigma_few = max(sigma, usual / np.sqrt(2.0 * WIDTH_COLUMNS * max(events, 1)))
+                edge2 = _changed_variance(widths, known, k, c, sigma_few)
+                rows.mixed[k, c] = edge2 > limit2
+                sigma2[k, c] += edge2
+                continue
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
-            if known and not _is_usual(widths.below, width, reach):
-                steady = not displacement * displacement > STEADY**2 * row2
-                weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
-                unusual2 = _unusual_variance(width, usual)
-                rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
-                more2 = max(more2, unusual2)
-            mixed2 = _mixed_variance(rows, smoothing, k, c, sigma_own) if known else 0.0
-            if mixed2 > 0.0:
-                rows.mixed[k, c] = True
-                more2 = max(more2, mixed2)
-            same_width[k, c], same[k, c] = _same_for(width, same_width[k, c], same[k, c], sigma)
-            if same[k, c] > 1.0:
+            weight, edge2 = 1.0, _changed_variance(widths, known, k, c, sigma)
+            if known:
+                edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, sigma_own))
+                if not _is_usual(widths.below, width, reach):
+                    steady = not displacement * displacement > STEADY**2 * row2
+                    weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
+                    edge2 = max(edge2, _unusual_variance(width, usual))
+            if widths.same[k, c] > 1.0:
                 widths.usual.number[_width_bin(width)] += weight
-            if same[k, c] > STEADY_PROFILES:
-                widths.steady[k, c] = same_width[k, c]
-            elif known and abs(width - usual) > STEADY * sigma:
-                before = usual if np.isnan(widths.steady[k, c]) else widths.steady[k, c]
-                changed2 = (PER_WIDTH * (width - before)) ** 2
-                rows.mixed[k, c] |= changed2 > _MARKED**2 * rows.sigma2[k, c]
-                more2 = max(more2, changed2)
-            sigma2[k, c] += more2
+            rows.mixed[k, c] = edge2 > limit2
+            sigma2[k, c] += max(edge2, widths.history.passing2[c // BLOCK_COLUMNS + 1])
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
