@@ -22,11 +22,11 @@ def missing_points(
     periods_per_profile: int,
 ) -> list[str]:
     """Return one line for each reason; ``counts`` are the counters of a `Reconstructor`."""
-    if gated := _gated(counts, settings, modulation):
-        return [gated]
-    few = _outside_region(counts)
+    if removed := _gated(counts, settings, modulation) or _outside_region(counts):
+        return [removed]
+    few = ""
     if settings.periods_per_profile:
-        few = few or _few_events(counts, modulation, columns, periods_per_profile)
+        few = _few_events(counts, modulation, columns, periods_per_profile)
     reasons = (
         _unmodulated(counts, modulation, columns),
         _cut(counts),
@@ -49,7 +49,8 @@ def _gated(counts: Mapping[str, int], settings: Settings, modulation: Modulation
 
 def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int) -> str:
     unmodulated = counts["columns_unmodulated"]
-    points = counts["points"] + counts["points_beyond_pole"]
+    found = ("points_found", "points_beyond_pole", "points_outside_roi")
+    points = sum(counts[name] for name in found)
     share = unmodulated / max(points + unmodulated, 1)
     # Background of dark columns, beside those of a line, has fewer events than these.
     line = counts["events_binned"] - counts["events_unmodulated"]
@@ -67,11 +68,11 @@ def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int
 
 
 def _cut(counts: Mapping[str, int]) -> str:
-    cut, points = counts["points_cut"], counts["points"]
+    cut, points = counts["points_cut"], counts["points_found"]
     if 2 * cut <= points:
         return ""
     return (
-        f"the sensor's edge cuts the line in {cut / max(points, cut):.0%} of the points; "
+        f"the sensor's edge cuts the line in {cut / points:.0%} of the points; "
         "move the surface nearer to the middle of the ranges"
     )
 
@@ -90,7 +91,7 @@ def _too_wide(counts: Mapping[str, int], settings: Settings) -> str:
 
 def _outside_region(counts: Mapping[str, int]) -> str:
     many = 2 * counts["events_outside_roi"] > counts["events"]
-    if not many or counts["columns_too_few_events"] < 10 * counts["points"]:
+    if not many or counts["columns_too_few_events"] < 10 * counts["points_found"]:
         return ""
     share = counts["events_outside_roi"] / counts["events"]
     return (
@@ -104,7 +105,7 @@ def _few_events(
 ) -> str:
     per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
     few = counts["columns_too_few_events"]
-    if few <= 10 * counts["points"] or per_column >= EVENTS_WANTED:
+    if few <= 10 * counts["points_found"] or per_column >= EVENTS_WANTED:
         return ""
     wanted = math.ceil(periods_per_profile * EVENTS_WANTED / max(per_column, 1e-3))
     return (

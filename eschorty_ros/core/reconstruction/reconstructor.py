@@ -126,8 +126,8 @@ class Reconstructor:
         )
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
-            events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
-            points_flagged=0, points_cut=0, columns_compensated=0,
+            events=0, events_filtered=0, points=0, points_found=0, points_beyond_pole=0,
+            points_outside_roi=0, points_flagged=0, points_cut=0, columns_compensated=0,
         )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
@@ -278,6 +278,7 @@ class Reconstructor:
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
             profiles = profiles.select(within)
+        self._counts["points_found"] += len(profiles)
         flagged = int(np.count_nonzero(profiles.flags))
         self._counts["points_flagged"] += flagged
         if flagged:
@@ -387,8 +388,8 @@ class Reconstructor:
         ``events_dropped``: without light there is no phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser.
-        ``points_flagged`` are some of ``points``, or with ``keep`` good left out; ``points_cut``,
-        by the sensor's edge, are some of those.
+        ``points_flagged`` are some of ``points_found`` within the limits, which are the ``points``
+        unless ``keep`` is good; ``points_cut``, by the sensor's edge, are some of those.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words``,
         ``broken_words`` and ``decoder_*`` come from the decoder.
         """

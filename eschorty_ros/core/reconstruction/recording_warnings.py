@@ -53,6 +53,7 @@ _LOSSES = {
     "{0.isolation_gate_px:g}; raise it, or lower isolation_events = {0.isolation_events}",
     "columns_ambiguous": "columns have two equally strong lines; set returns to all",
     "points_beyond_pole": "points are beyond the last range of the calibration; check it",
+    "points_outside_roi": "points are outside range_min and range_max; widen them",
     "points_outside_scan": "points are outside start to stop of the recorded scan; check the "
     "stage's positions",
 }

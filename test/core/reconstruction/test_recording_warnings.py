@@ -13,8 +13,10 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
 from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
+from eschorty_ros.core.reconstruction.settings import KEEP
 from eschorty_ros.core.storage import ScanLog, load_recording
 from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -111,6 +113,27 @@ def test_lines_that_the_limits_of_the_range_cut_are_no_fault_of_the_camera(tmp_p
     recording = simulate_recording(tmp_path, named("steps"), build, stop_mm=30.0)
     result = reconstruct_recording(recording, Settings(range_max=1.3))
     assert (result.warnings, len(result.points) > 0) == ((), True)
+
+
+def test_limits_of_the_range_without_a_point_are_the_reason(tmp_path):
+    build = replace(NARROW, columns=480, principal_column=239.5)
+    recording = simulate_recording(
+        tmp_path, named("steps"), build, stop_mm=30.0, parameters=preset("noisy")
+    )
+    result = reconstruct_recording(recording, Settings(range_min=1.3, range_max=1.301))
+    (line,) = result.warnings
+    assert "points are outside range_min and range_max; widen them" in line
+    assert len(result.points) == 0
+
+
+def test_the_share_of_cut_points_is_the_same_where_only_good_ones_are_kept(tmp_path):
+    build = replace(NARROW, columns=480, principal_column=239.5)
+    near = Plane(build.model().range_limits_mm[0] + 8.0, slope_column=0.9)
+    recording = simulate_recording(tmp_path, near, build, stop_mm=16.0, seed=1)
+    found = {keep: reconstruct_recording(recording, Settings(keep=keep)) for keep in KEEP}
+    counters = found["all"].counters
+    assert 0.33 < counters["points_cut"] / counters["points"] < 0.5, "seed 1"
+    assert found["all"].warnings == found["good"].warnings == ()
 
 
 @pytest.mark.parametrize("start_mm", [51.2, 51.8])
