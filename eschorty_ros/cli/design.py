@@ -29,7 +29,12 @@ _LIGHT_S = 0.5 / 70.0
 
 @click.command("design")
 @click.option(
-    "--focal-mm", type=Number(), default=24.0, show_default=True, help="Focal length, mm."
+    "--focal-mm",
+    "focal_length_mm",
+    type=Number(),
+    default=24.0,
+    show_default=True,
+    help="Focal length, mm.",
 )
 @click.option("--f-number", type=Number(), default=2.0, show_default=True, help="Aperture.")
 @click.option(
@@ -67,20 +72,13 @@ _LIGHT_S = 0.5 / 70.0
     help="Also write the plots here, .png, .pdf or .svg, or the build, .yaml.",
 )
 def command(
-    focal_mm: float,
-    f_number: float,
-    theta_deg: float,
     theta_prime_deg: float | None,
-    near_mm: float,
     far_mm: float | None,
-    b_mm: float,
     ranges: int,
-    pixel_um: float,
-    columns: int,
-    rows: int,
     power_mw: float | None,
     wavelength_nm: float,
     outs: tuple[Path, ...],
+    **given: Any,
 ) -> None:
     """Tabulate range, sampling and depth of field of an optical build.
 
@@ -109,16 +107,6 @@ def command(
             check_output(out)
         else:
             check_picture(out)
-    given: dict[str, Any] = {
-        "focal_length_mm": focal_mm,
-        "f_number": f_number,
-        "theta_deg": theta_deg,
-        "near_mm": near_mm,
-        "b_mm": b_mm,
-        "pixel_um": pixel_um,
-        "columns": columns,
-        "rows": rows,
-    }
     if far_mm is not None:
         build = design_for_ranges(far_mm=far_mm, **given)
     else:

@@ -10,6 +10,7 @@ import click
 
 from eschorty_ros.core.optics import SHIPPED
 from eschorty_ros.simulation.pixels import PRESETS
+from eschorty_ros.simulation.scenes import NAMES
 
 SWEEP_MAX_MM = 1000.0
 """Longer than any stage that scans; a recording of it would fill a disk."""
@@ -36,8 +37,7 @@ _SWEEP = (
         "--scene",
         default="steps",
         show_default=True,
-        help="steps, plane, tilted, sphere, leaves, face, posts, receding, or a mesh in "
-        "metres (needs open3d).",
+        help=f"{', '.join(NAMES)}, or a mesh in metres (needs open3d).",
     ),
     click.option(
         "--frequency",

@@ -8,19 +8,18 @@ import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.sigma import ErrorModel
+from eschorty_ros.core.line.sigma import BACKGROUND_FACTORS, ErrorModel
 from eschorty_ros.core.line.window import FRACTION, HALF_WIDTH_PER_FWHM, ROW_LAST, ROW_MASK
 
 METHODS = ("mode_mean", "mean", "median")
 CENTROIDS = (*METHODS, "learned")
 """The methods, and the one that follows a stream."""
-FULL_COLUMN_METHODS = ("mean", "median")
+FULL_COLUMN_METHODS = tuple(BACKGROUND_FACTORS)
 RETURNS = ("strongest", "first", "last", "all")
 
 # Codes are indices of the tuples above.
-_MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = map(
-    CENTROIDS.index, ("mode_mean", "mean", "median", "learned")
-)
+_MODE_MEAN, _MEDIAN, _LEARNED = map(CENTROIDS.index, ("mode_mean", "median", "learned"))
+_FULL_COLUMN = tuple(map(CENTROIDS.index, FULL_COLUMN_METHODS))
 _STRONGEST, _LAST, _ALL = map(RETURNS.index, ("strongest", "last", "all"))
 
 FWHM_PER_SIGMA = 2.3548200450309493
@@ -76,7 +75,7 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
 
 @kernel
 def _is_windowed(method):
-    return method != _MEAN and method != _MEDIAN
+    return method not in _FULL_COLUMN
 
 
 @kernel(forceinline=True)

@@ -29,8 +29,8 @@ SIGMA_FLOOR_PX = 0.25
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
-# The factor b of methods that use full columns.
-_BACKGROUND = {"mean": 1.35, "median": 2.2}
+BACKGROUND_FACTORS = {"mean": 1.35, "median": 2.2}
+"""The factor b of each method that uses full columns."""
 
 
 class ErrorModel(NamedTuple):
@@ -50,7 +50,7 @@ def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> Erro
     return ErrorModel(
         factor=number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
         floor=number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
-        background=_BACKGROUND.get(method, 0.0),
+        background=BACKGROUND_FACTORS.get(method, 0.0),
         median=method == "median",
     )
 
