@@ -37,9 +37,9 @@ RECENT_PROFILES = 16.0
 # than what its rows scatter.
 _FAST_PX = 0.5
 # A width or row is the same while it changes by so many deviations at most, and steady when it has
-# been so for more than a quarter of the recent profiles.
+# been so for more than two profiles.
 STEADY = 2.0 * np.sqrt(2.0)
-STEADY_PROFILES = 0.25 * RECENT_PROFILES
+STEADY_PROFILES = 2.0
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)

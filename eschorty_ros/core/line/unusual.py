@@ -4,7 +4,9 @@ An edge of range or reflectance within the line's thickness leaves a part of the
 side by side, and moves the row by up to half of the change of the full width. A width is unusual
 when few lines of the stream have it for longer than a profile: the width of a line that a step
 crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
-one that changes is compared with the last that did not, or with the median of all.
+one that changes is compared with the last that was steady, or else with the median of all. An edge
+leaves one end of the line where it is: where the row does not move with the width, the light has
+changed.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
@@ -74,34 +76,38 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``static_width`` less what motion adds, ``last_row`` the rows of the last one. The
-    ``same_width`` has been the same for ``same`` profiles; ``steady`` is the last that was for
-    some. The ``history`` has what changes.
+    ``static_width`` less what motion adds, ``last`` and ``last_row`` widths and rows of the last
+    one. The ``same_width`` has been the same for ``same`` profiles; ``steady``, with
+    ``steady_row``, is the last that was for some. The ``history`` has what changes.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
     smoothed: NDArray[np.float64]
     static_width: NDArray[np.float64]
+    last: NDArray[np.float64]
+    last_row: NDArray[np.float64]
     same_width: NDArray[np.float64]
     same: NDArray[np.float64]
-    last_row: NDArray[np.float64]
     steady: NDArray[np.float64]
+    steady_row: NDArray[np.float64]
     history: LineHistory
 
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, static_width, same_width, last_row, steady = np.full((5, returns, columns), np.nan)
+    shape = returns, columns
     return Widths(
         usual=empty_usual_widths(),
         below=np.zeros(_BINS + 1),
-        smoothed=smoothed,
-        static_width=static_width,
-        same_width=same_width,
-        same=np.zeros((returns, columns)),
-        last_row=last_row,
-        steady=steady,
+        smoothed=np.full(shape, np.nan),
+        static_width=np.full(shape, np.nan),
+        last=np.full(shape, np.nan),
+        last_row=np.full(shape, np.nan),
+        same_width=np.full(shape, np.nan),
+        same=np.zeros(shape),
+        steady=np.full(shape, np.nan),
+        steady_row=np.full(shape, np.nan),
         history=empty_history(columns, common_px, windowed),
     )
 
@@ -146,7 +152,8 @@ def _restart_widths(widths, known):
     usual, history = widths.usual, widths.history
     recent, polarities = history.recent, history.polarities
     usual.number[:], usual.median.difference = known.number, known.median.difference
-    widths.same_width[:], widths.last_row[:], widths.steady[:] = np.nan, np.nan, np.nan
+    widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
+    widths.steady[:], widths.steady_row[:] = np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     recent.jitter2[:], recent.same_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
     recent.same[:], recent.before[:] = 0.0, 0.0
@@ -278,30 +285,40 @@ def _moved_median(median, value, values):
 
 
 @kernel
-def _changed_variance(widths, known, k, c, sigma_width):
-    """Return the variance of a row whose line has changed its width, px squared.
+def _changed_variance(widths, known, k, c, row, sigma_width):
+    """Return the variance of a ``row`` whose line has changed its width at an edge, px squared.
 
-    It is 0 where the width is steady, or the usual one.
+    An edge leaves one end of the line where it is, so that the row moves with the width: since it
+    was steady or, where it has not been so yet, since the last profile. Else the variance is 0.
     """
     width, usual = widths.static_width[k, c], widths.usual.median.width
     same_width, same = widths.same_width, widths.same
+    moved = abs(row - widths.last_row[k, c])
+    if moved > width:
+        # Another surface.
+        same_width[k, c] = np.nan
     same_width[k, c], same[k, c] = _same_for(width, same_width[k, c], same[k, c], sigma_width)
     if same[k, c] > STEADY_PROFILES:
-        widths.steady[k, c] = same_width[k, c]
+        widths.steady[k, c], widths.steady_row[k, c] = same_width[k, c], row
         return 0.0
     if not known or abs(width - usual) <= STEADY * sigma_width:
         return 0.0
-    before = usual if np.isnan(widths.steady[k, c]) else widths.steady[k, c]
-    return (PER_WIDTH * (width - before)) ** 2
+    before = widths.steady[k, c]
+    if not np.isnan(before):
+        change = PER_WIDTH * abs(width - before)
+        return change * change if abs(row - widths.steady_row[k, c]) > 0.5 * change else 0.0
+    change = PER_WIDTH * abs(width - widths.last[k, c])
+    at_edge = change > PER_WIDTH * sigma_width and 0.5 * change < moved < 2.0 * change
+    return (PER_WIDTH * (width - usual)) ** 2 if at_edge else 0.0
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, lit_share):
+def _mark_unusual(rows, smoothing, few, lit_share):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
-    smoothed, last_row = widths.smoothed, widths.last_row
+    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
@@ -318,10 +335,13 @@ def _mark_unusual(rows, smoothing, lit_share):
                 widths.same_width[k, c] = np.nan
                 continue
             events = rows.events[k, c]
-            if events < smoothing.isolation_events:
+            if few <= events < smoothing.isolation_events:
+                widths.same_width[k, c] = np.nan
+                continue
+            if events < few:
                 # The width of few events scatters by more than those of most lines.
                 sigma_few = max(sigma, usual / np.sqrt(2.0 * WIDTH_COLUMNS * max(events, 1)))
-                edge2 = _changed_variance(widths, known, k, c, sigma_few)
+                edge2 = _changed_variance(widths, known, k, c, row[k, c], sigma_few)
                 rows.mixed[k, c] = edge2 > limit2
                 sigma2[k, c] += edge2
                 continue
@@ -329,14 +349,14 @@ def _mark_unusual(rows, smoothing, lit_share):
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
-            weight, edge2 = 1.0, _changed_variance(widths, known, k, c, sigma)
+            weight, edge2 = 1.0, _changed_variance(widths, known, k, c, row[k, c], sigma)
             if known:
                 edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, sigma_own))
                 if not _is_usual(widths.below, width, reach):
                     steady = not displacement * displacement > STEADY**2 * row2
                     weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                     edge2 = max(edge2, _unusual_variance(width, usual))
-            if widths.same[k, c] > 1.0:
+            if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
             sigma2[k, c] += max(edge2, widths.history.passing2[c // BLOCK_COLUMNS + 1])
@@ -345,6 +365,6 @@ def _mark_unusual(rows, smoothing, lit_share):
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            last_row[k, c] = row[k, c]
+            last[k, c], last_row[k, c] = widths.static_width[k, c], row[k, c]
     widths.usual.median.difference = median
     _update(widths, columns)

@@ -421,13 +421,13 @@ def _close(memory):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
-    _mark_unusual(rows, smoothing, memory.light.lit_share)
+    few = _few_events(rows, smoothing.isolation_events, state)
+    _mark_unusual(rows, smoothing, few, memory.light.lit_share)
     followed = _points_followed(smoothing.widths.history)
     counters.points_followed += followed.points
     counters.points_burst_shift += followed.shifted
     counters.points_one_polarity += followed.of_one_polarity
     _learn_line(memory, half, learns, late)
-    few = _few_events(rows, smoothing.isolation_events, state)
     delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
