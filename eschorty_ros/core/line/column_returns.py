@@ -27,7 +27,7 @@ from eschorty_ros.core.line.window import (
 )
 
 # Windows of a column that are tested for the laser's modulation.
-_WINDOWS_MAX = 4
+_WINDOWS_MAX = 16
 # Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
 # column's own.
 _VOTE = 0.45

@@ -29,7 +29,8 @@ from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
 # Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.
 SIGMA_COMMON_PX = 0.04
-# Larger differences from profile to profile are those of another surface.
+# Larger differences from profile to profile are those of another surface, unless all columns have
+# them and they go on.
 _JITTER_MAX_PX = 1.0
 # Profiles whose mean a profile is compared with.
 RECENT_PROFILES = 16.0
@@ -159,6 +160,8 @@ def _compare_polarities(columns, half, first, history):
             continue
         row, apart = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
         if np.isnan(row):
+            # Background has the other polarity now and then: most columns decide.
+            mean.all_columns[block] = max(mean.all_columns[block] - 1.0, 0.0)
             continue
         mean.all_columns[block] = min(mean.all_columns[block] + 1.0, RECENT_PROFILES)
         mean.apart[block] += (apart - mean.apart[block]) / mean.all_columns[block]
@@ -202,6 +205,23 @@ def _changed_since_steady(recent, block, width, width2):
 
 
 @kernel(_nrt=False)
+def _move_alike(now, recent):
+    """Return whether blocks have moved together since the last profile, as where the unit shakes.
+
+    Then most of the mean square of their displacements is that of the mean.
+    """
+    blocks, total, squares = 0, 0.0, 0.0
+    for block in range(1, now.points.size - 1):
+        points = _near_sum(now.points, block)
+        if points > 0.0 and recent.profiles[block] > 0.0:
+            difference = _near_sum(now.row, block) / points - recent.last[block]
+            blocks += 1
+            total += difference
+            squares += difference * difference
+    return 2.0 * total * total > blocks * squares
+
+
+@kernel(_nrt=False)
 def _compare_with_recent(history, known, usual, width_variance):
     """Compare the sums of a profile with recent profiles, and add them.
 
@@ -209,6 +229,7 @@ def _compare_with_recent(history, known, usual, width_variance):
     the edge.
     """
     now, recent, polarities = history.now, history.recent, history.polarities
+    alike = _move_alike(now, recent)
     for block in range(1, now.points.size - 1):
         points, profiles = _near_sum(now.points, block), recent.profiles[block]
         history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
@@ -240,8 +261,12 @@ def _compare_with_recent(history, known, usual, width_variance):
             shift_px = history.shift_px[block]
             history.moved2[block] = min(max(moved2, 0.0), off2) + shift_px * shift_px
             difference, before = row - recent.last[block], recent.difference[block]
-            if max(abs(difference), abs(before)) < _JITTER_MAX_PX and profiles > 2.0:
-                recent.jitter2[block] -= weight * (difference * before + recent.jitter2[block])
+            near = max(abs(difference), abs(before)) < _JITTER_MAX_PX
+            if (near or alike) and profiles > 2.0:
+                # A single large jump of all columns is another surface, and counts little.
+                most = max(_JITTER_MAX_PX**2, 4.0 * recent.jitter2[block])
+                product = min(max(difference * before, -most), most)
+                recent.jitter2[block] -= weight * (product + recent.jitter2[block])
             recent.difference[block] = difference
             history.moved2[block] += max(recent.jitter2[block] - own2, 0.0)
         recent.last[block] = row

@@ -18,7 +18,7 @@ from eschorty_ros.core.storage.recording import between
 
 # Bytes that show the frequency, more where they hold few turns of it: lamps have near ones.
 _PIECE_BYTES, _PIECES_MAX = 1 << 23, 8
-_TURNS_ENOUGH = 20
+_TURNS_ENOUGH = 60
 # So many events of a chunk show what all do.
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
@@ -127,9 +127,12 @@ def recording_warnings(
             f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
             f"{shown_hz:.4g} Hz; correct it{or_slow}"
         )
-    elif shown_hz is not None and len(points):
-        found += _duty_faults(recording.modulation, shown.duty)
-        if not counters["triggers_used"]:
+    elif shown_hz is not None:
+        duty = shown.duty
+        # Without a point ON and OFF may be swapped, which shows the rest of the period.
+        swapped = duty is not None and abs(1.0 - duty - recording.modulation.duty) < _DUTY_APART
+        found += _duty_faults(recording.modulation, duty) if len(points) or not swapped else []
+        if len(points) and not counters["triggers_used"]:
             found += _edge_faults(recording.modulation, shown.edge_us)
     without_stage = counters["points_without_stage"]
     if without_stage:

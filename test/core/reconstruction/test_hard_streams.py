@@ -500,22 +500,26 @@ def test_sigma_has_what_texture_moves_the_rows_by(compensation):
     assert within[1] > 0.9
 
 
-def test_sigma_has_what_all_rows_jump_by_from_profile_to_profile():
-    """As where a readout takes longer than a burst, and a period begins anywhere in it."""
+# 0.19 within 2 sigma where jumps of more than a row are left out.
+@pytest.mark.parametrize(("deviation_px", "least"), [(0.25, (0.55, 0.9)), (1.0, (0.45, 0.75))])
+def test_sigma_has_what_all_rows_jump_by_from_profile_to_profile(deviation_px, least):
+    """As where a readout takes longer than a burst, or where the unit shakes."""
     camera = Camera(periods=40)
-    jumps_px = np.random.default_rng(4).normal(0.0, 0.25, camera.periods)
+    jumps_px = np.random.default_rng(4).normal(0.0, deviation_px, camera.periods)
     found, _ = points(camera, camera.line(lambda k, c: wavy(k, c) + jumps_px[k]))
     later = found.select(found.period >= 8)
     within = [np.mean(np.abs(error_px(later)) < k * later.sigma_row) for k in (1.0, 2.0)]
-    assert 0.55 < within[0] < 0.85, f"seeds {camera.seed} and 4"
-    assert within[1] > 0.9
+    assert least[0] < within[0] < 0.85, f"seeds {camera.seed} and 4"
+    assert within[1] > least[1]
 
 
-@pytest.mark.parametrize("lamp_hz", [100.0, 120.0])
-def test_a_lamp_beside_the_line_is_not_taken_for_it(lamp_hz):
+@pytest.mark.parametrize(
+    ("lamp_hz", "half_width_px"), [(100.0, 15.0), (120.0, 15.0), (120.0, 60.0)]
+)
+def test_a_lamp_beside_the_line_is_not_taken_for_it(lamp_hz, half_width_px):
     """It flickers at twice the mains frequency, and has more events than the line."""
     camera = Camera(periods=60)
-    flicker = {"half_width_px": 15.0, "threshold": 0.5, "events_max": 9, "delay_us": 600.0}
+    flicker = {"half_width_px": half_width_px, "threshold": 0.5, "events_max": 9, "delay_us": 600.0}
     lamp = Camera(frequency_hz=lamp_hz, periods=round(60 * lamp_hz / 70.0), seed=7, **flicker)
     beside = lamp.line(lambda _, c: np.where(np.abs(c - 640) < 80, 520.0, np.nan))
     found, _ = points(camera, camera.line(wavy), beside)
@@ -556,16 +560,20 @@ def test_a_line_that_moves_at_1_khz_is_no_fault_of_the_readout(tmp_path):
     assert reconstruct_recording(recording).warnings == (), "seed 1"
 
 
-@pytest.mark.parametrize("polarity", [0, 1])
+@pytest.mark.parametrize(("polarity", "others"), [(0, 0), (1, 0), (1, 150)])
 def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger_sigma(
-    polarity, tmp_path
+    polarity, others, tmp_path
 ):
+    """Background, one in so many of the ``others``, has both."""
     scene = named("tilted", MODEL)
     recording = simulate_recording(
         tmp_path, scene, CALIBRATION, Modulation(70.0), 10.0, 100.0, 300.0, 1
     )
     events = Decoder().decode(b"".join(RawReader(recording.events_path).mapped(1 << 20)))
-    one = (values[events.p == polarity] for values in (events.t, events.x, events.y, events.p))
+    kept = events.p == polarity
+    if others:
+        kept[::others] = True
+    one = (values[kept] for values in (events.t, events.x, events.y, events.p))
     found, reconstructor = reconstruct(stream(tuple(one)), recording.modulation, Settings())
     stage_mm = recording.stage.position_mm(found.t_us)
     truth_mm = true_range_mm(scene, MODEL, stage_mm, found.column)

@@ -202,6 +202,7 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
             for hz in (35, 71, 100, 140, 700)
         ),
         (lambda r: with_duty(r, 0.2), {}, "duty cycle is given as 0.2 and the events show 0.5", 1),
+        (lambda r: with_duty(r, 0.95), {}, "cycle is given as 0.95 and the events show 0.5", 0),
         (lambda r: with_duty(r, 0.8), {}, "duty cycle is given as 0.8 and the events show 0.5", 1),
         (lambda r: with_edge(r, 2000), {}, "us after the edge that the events show", 1),
         (lambda r: with_edge(r, -5000), {}, "us before the edge that the events show", 1),
