@@ -72,7 +72,8 @@ def read_parameters(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             if not of_ros(parameter):
                 with _in_file(document.at((full_name, _KEY, parameter))):
                     check_name(parameter, f"parameter of {full_name}", list(params))
-                    params[parameter].check(value, f"{full_name}:")
+                    checked = params[parameter]
+                    checked.check(checked.converted(value), f"{full_name}:")
         tables.setdefault(name, {}).update(values)
     return tables
 

@@ -71,6 +71,19 @@ class Param:
                 ]
         return descriptor
 
+    def converted(self, value: Any) -> Any:
+        """Return the value of the parameter that ``value`` stands for, else itself.
+
+        That is an integer's for a float, and in YAML, which ROS reads, the words on and off are
+        truth values.
+        """
+        if isinstance(self.default, float) and type(value) is int:
+            return float(value)
+        if isinstance(value, bool):
+            word = "on" if value else "off"
+            return word if word in self.choices else value
+        return value
+
     def check(self, value: Any, what: str = "parameter") -> None:
         """Raise ``ArgumentError`` unless ``value`` has type and range, or is one of the choices."""
         given = f"{what} {self.name} is {short(value)}"
@@ -180,13 +193,10 @@ class Parameters(Mapping[str, Any]):
 
     def _as_declared(self, parameter: Parameter[Any]) -> Parameter[Any]:
         declared = self._table.get(parameter.name)
-        if (
-            declared is not None
-            and isinstance(declared.default, float)
-            and type(parameter.value) is int
-        ):
-            return Parameter(parameter.name, value=float(parameter.value))
-        return parameter
+        if declared is None:
+            return parameter
+        value = declared.converted(parameter.value)
+        return parameter if value is parameter.value else Parameter(parameter.name, value=value)
 
     def _validate(self, proposed: Sequence[Parameter[Any]]) -> SetParametersResult:
         changes = {p.name: p.value for p in proposed if p.name in self._table}
@@ -207,7 +217,7 @@ def _declare(node: Node, param: Param) -> None:
         try:
             node.declare_parameter(param.name, param.default, param.descriptor())
         except InvalidParameterTypeException:
-            value = _given_integer(node, param)
+            value = _given(node, param)
             node.declare_parameter(param.name, value, param.descriptor(), ignore_override=True)
     except (
         InvalidParameterTypeException,
@@ -217,14 +227,11 @@ def _declare(node: Node, param: Param) -> None:
         raise ArgumentError(f"parameter {param.name} refused: {error}") from error
 
 
-def _given_integer(node: Node, param: Param) -> float:
-    """Return the integer given at start for a float parameter, as a float."""
+def _given(node: Node, param: Param) -> Any:
+    """Return the value given at start in another type, in the parameter's one."""
     probe = ParameterDescriptor(dynamic_typing=True)
     given = node.declare_parameter(param.name, param.default, probe).value
     node.undeclare_parameter(param.name)
-    if isinstance(param.default, float) and type(given) is int:
-        return float(given)
-    raise ArgumentError(
-        f"parameter {param.name} is {given!r}; give a value of type "
-        f"{type(param.default).__name__}, such as {param.default!r}"
-    )
+    value = param.converted(given)
+    param.check(value)
+    return value

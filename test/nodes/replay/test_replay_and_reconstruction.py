@@ -247,8 +247,6 @@ def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
         {item.name: item.default for item in launch_arguments.REPLAY}
         | {"recording": str(recording.path)}
     ).nodes["reconstruction"]
-    # On a command line `off` would be a truth value.
-    parameters = {name: value for name, value in parameters.items() if value != "off"}
     domain = free_domain()
     with (
         NodeProcess(NODES.format("reconstruction"), parameters, domain=domain),
