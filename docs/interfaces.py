@@ -17,6 +17,7 @@ from unittest import mock
 
 import rclpy
 from rclpy.action import get_action_server_names_and_types_by_node
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -118,6 +119,8 @@ def every_node() -> Iterator[list[Node]]:
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
+        # The level is one of the process, of later tests, too.
+        set_logger_level("", LoggingSeverity.INFO)
 
 
 def topics(nodes: list[Node]) -> dict[str, Topic]:

@@ -37,7 +37,8 @@ def test_every_interface_of_the_source_is_built() -> None:
     for kind in ("msg", "srv", "action"):
         sources = {path.stem for path in (ROOT / kind).glob(f"*.{kind}")}
         assert sources
-        assert sources == {path.stem for path in (share / kind).glob(f"*.{kind}")}
+        built = {path.stem for path in (share / kind).glob(f"*.{kind}")}
+        assert sources == built, "run: make setup"
 
 
 def test_installed_layout() -> None:
@@ -45,7 +46,7 @@ def test_installed_layout() -> None:
     prefix = share.parents[1]
     for folder in ("config", "launch"):
         names = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
-        assert names <= {path.name for path in (share / folder).iterdir()}
+        assert names <= {path.name for path in (share / folder).iterdir()}, "run: make setup"
     for script in (*(prefix / "lib" / "eschorty_ros").iterdir(), prefix / "bin" / "eschorty"):
         assert os.access(script, os.X_OK)
 
