@@ -11,8 +11,8 @@ _OTHER_FREQUENCY = 1e-3
 class LightWarnings:
     """Warnings about a stream since the laser was switched on, or since the scan began.
 
-    Where the light has ended they are those of its end: periods without light have few events, and
-    follow no laser.
+    After the light has ended they are those of its last period: those without light have few
+    events, which do not follow the laser.
     """
 
     def __init__(self) -> None:

@@ -46,7 +46,7 @@ _MIXED_WEIGHT = 0.25
 _MOVING_WEIGHT = 0.05
 # Points without which no width is usual.
 _POINTS_MIN = 512.0
-# Points that are remembered, in profiles of all columns.
+# Points that count, in profiles of all columns.
 _PROFILES_KEPT = 256
 # The widths that a window begins with count as so many profiles.
 _PROFILES_KNOWN = 16
@@ -132,7 +132,7 @@ def _keep_widths(widths, known):
 
 @kernel
 def _update(widths, columns):
-    """Bring the sums and the median up to date, and halve what is remembered when it is much."""
+    """Bring the sums and the median up to date; halve the numbers when there are many points."""
     number, below = widths.usual.number, widths.below
     if below[_BINS] > _PROFILES_KEPT * columns:
         number *= 0.5

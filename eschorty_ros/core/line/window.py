@@ -37,6 +37,7 @@ _ONE_BITS = np.uint32(20)
 _ONE = np.uint32(1 << 20)
 # Entries summed in 32 bits: 512 times (row or row squared or time) still fits.
 CHUNK = np.uintp(512)
+# Events up to which counting around each of them is faster than sums over all rows.
 _PAIRWISE_MAX = 192
 # No event is near this row, so that no row is avoided.
 _NOWHERE = -(1 << 40)
@@ -213,6 +214,7 @@ def _mean_shift(column, centre, half, first, last):
 
 @kernel(_nrt=False)
 def _densest_pairwise(column, radius, avoid, gap):
+    """Find the densest box by counting around every event."""
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
     highest = np.int64(0)
@@ -231,6 +233,7 @@ def _densest_pairwise(column, radius, avoid, gap):
 
 @kernel(_nrt=True)
 def _densest_histogram(column, radius, avoid, gap):
+    """Find the densest box by sums over the rows: the same one."""
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
     for i in range(column.start, column.start + column.events):

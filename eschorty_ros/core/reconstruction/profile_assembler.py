@@ -57,8 +57,8 @@ class Edges(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends with the window of the estimate, or when the usual widths are
-    known.
+    With ``one_window`` the pass ends where the estimate of the line starts again
+    (`WINDOW_EVENTS`), or as soon as the usual widths are known.
     """
 
     floor_us: int

@@ -57,7 +57,7 @@ from eschorty_ros.srv import BeginScan, EndScan
 _TICK_LIMIT_S = 1.0
 # Part of the laser's reason when a heartbeat is missing.
 _HEARTBEAT = "/heartbeat"
-# The middleware forgets a node that has been killed within 20 s.
+# DDS drops a node that has been killed within 20 s.
 _DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
 _ASSEMBLE_S = 60.0
