@@ -65,7 +65,8 @@ class Setting(Schema):
     """One setting: set by ``command value``, read by ``command?``.
 
     ``minimum`` and ``maximum`` bound a number. A read-back equals what was set when it differs
-    by ``tolerance`` plus ``tolerance_share`` of the value at most.
+    by ``tolerance`` plus ``tolerance_share`` of the value at most. A switch is set with the words
+    ``on`` and ``off``, which count in its replies, too.
     """
 
     command: Text
@@ -74,6 +75,8 @@ class Setting(Schema):
     maximum: float | None = None
     tolerance: NotNegative = 0.0
     tolerance_share: NotNegative = 0.0
+    on: Text = "ON"
+    off: Text = "OFF"
 
     def _conflicts(self) -> Iterator[tuple[str, str]]:
         if {"{", "}"} & set(self.command.replace("{channel}", "")):
@@ -85,9 +88,7 @@ class Setting(Schema):
             allowed = self.tolerance + self.tolerance_share * abs(float(requested))
             return abs(float(found) - float(requested)) <= allowed
         if self.kind == "keyword":
-            # SCPI keywords have a long form and a short one, which is its capitals.
-            short = "".join(letter for letter in str(requested) if not letter.islower())
-            return str(found).upper() in (str(requested).upper(), short)
+            return str(found).upper() in keyword_forms(str(requested))
         return bool(requested) == bool(found)
 
     def check(self, name: str, value: Value) -> None:
@@ -152,6 +153,11 @@ class AwgProfile(Schema):
             yield "settings", f"remove {', '.join(unknown)}, which nothing uses"
         if self.dark_limit_v < self.dark_high_v:
             yield "dark_limit_v", "raise it to dark_high_v or more"
+
+
+def keyword_forms(keyword: str) -> tuple[str, str]:
+    """Return the two forms of a SCPI keyword in capitals: the long one, and the short one."""
+    return keyword.upper(), "".join(letter for letter in keyword if not letter.islower())
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value, keyword_forms
 from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 
@@ -96,6 +96,8 @@ class Scpi:
         """Return the command that sets ``name``."""
         setting = self._profile.settings[name]
         setting.check(name, value)
+        if isinstance(value, bool):
+            value = setting.on if value else setting.off
         return f"{setting.command.format(channel=channel)} {_text(value)}"
 
     def _attempt(self, step: Callable[[], Result]) -> Result:
@@ -133,9 +135,9 @@ class Scpi:
         setting, replies = self._profile.settings[name], self._profile.replies
         word = reply.strip("\"' ").upper()
         if setting.kind == "switch":
-            if word in replies.on:
+            if word in (*replies.on, *keyword_forms(setting.on)):
                 return True
-            if word in replies.off:
+            if word in (*replies.off, *keyword_forms(setting.off)):
                 return False
         elif setting.kind == "number":
             match = _NUMBER.fullmatch(reply)
@@ -150,10 +152,8 @@ class Scpi:
         )
 
 
-def _text(value: Value) -> str:
+def _text(value: float | str) -> str:
     """Return a value as SCPI text: plain decimals, no exponents."""
-    if isinstance(value, bool):
-        return "ON" if value else "OFF"
     if isinstance(value, str):
         return value.upper()
     return f"{value:.9f}".rstrip("0").rstrip(".")

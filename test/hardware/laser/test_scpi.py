@@ -1,5 +1,7 @@
 """SCPI layer: any reply is a value of the kind that was requested, or a typed error."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -100,3 +102,14 @@ def test_numbers_are_plain_decimals(value: float, text: bytes) -> None:
     link = Answering()
     scpi(link).set("frequency", value, 1)
     assert link.written == [b":CHANnel1:BASE:FREQuency " + text + b"\n"]
+
+
+def test_a_switch_has_the_words_of_its_setting() -> None:
+    words = replace(PROFILE.settings["inversion"], on="INVerted", off="NORMal")
+    profile = replace(PROFILE, settings={**PROFILE.settings, "inversion": words})
+    other = Scpi(
+        Answering(b"NORM", b"INVERTED"), profile, lambda: None, {"faults": 0, "retries": 0}
+    )
+    assert other.spelt("inversion", False, 2).endswith(" NORMAL")
+    assert other.spelt("output", False, 2).endswith(" OFF")
+    assert [other.get("inversion", 2), other.get("inversion", 2)] == [False, True]
