@@ -8,7 +8,8 @@ middle is its uncertainty, up to the displacement of the line from profile to pr
 of events of one kind alone.
 
 Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
-Minus their mean product is the variance of the jumps; a steady displacement has none.
+The mean square of the smaller one, with that sign, shows the variance of the jumps; a steady
+displacement has none, nor has a single jump to another surface.
 
 A line that gets narrower or wider for a few profiles passes an edge, and is off by half of the rows
 that are missing, or new, at most. Means over blocks show changes that are too small to be seen in a
@@ -30,8 +31,10 @@ from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 # Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.
 SIGMA_COMMON_PX = 0.04
 # Larger differences from profile to profile are those of another surface, unless all columns have
-# them and they go on.
+# them.
 _JITTER_MAX_PX = 1.0
+# Variance of independent jumps over what the smaller of two successive differences shows of it.
+_JITTER_PER_BACK = 1.5
 # Profiles whose mean a profile is compared with.
 RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
@@ -59,7 +62,7 @@ class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
-    ``jitter2`` the mean of minus the products of successive differences. The ``same_width`` has
+    ``jitter2`` the variance of rows that jump forth and back. The ``same_width`` has
     been the same for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last
     that was for some.
     """
@@ -263,10 +266,9 @@ def _compare_with_recent(history, known, usual, width_variance):
             difference, before = row - recent.last[block], recent.difference[block]
             near = max(abs(difference), abs(before)) < _JITTER_MAX_PX
             if (near or alike) and profiles > 2.0:
-                # A single large jump of all columns is another surface, and counts little.
-                most = max(_JITTER_MAX_PX**2, 4.0 * recent.jitter2[block])
-                product = min(max(difference * before, -most), most)
-                recent.jitter2[block] -= weight * (product + recent.jitter2[block])
+                # The smaller of the two: one large jump alone is another surface.
+                back = -np.sign(difference * before) * min(abs(difference), abs(before)) ** 2
+                recent.jitter2[block] += weight * (_JITTER_PER_BACK * back - recent.jitter2[block])
             recent.difference[block] = difference
             history.moved2[block] += max(recent.jitter2[block] - own2, 0.0)
         recent.last[block] = row

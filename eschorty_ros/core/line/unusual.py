@@ -359,7 +359,12 @@ def _mark_unusual(rows, smoothing, few, lit_share):
             if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
-            sigma2[k, c] += max(edge2, widths.history.passing2[c // BLOCK_COLUMNS + 1])
+            # An edge beside a line that has, within its scatter, the usual and its steady width.
+            apart = abs(width - usual)
+            if not np.isnan(widths.steady[k, c]):
+                apart = max(apart, abs(width - widths.steady[k, c]))
+            own2 = PER_WIDTH**2 * (apart * apart + sigma * sigma)
+            sigma2[k, c] += max(edge2, min(widths.history.passing2[c // BLOCK_COLUMNS + 1], own2))
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
