@@ -359,12 +359,14 @@ def _mark_unusual(rows, smoothing, few, lit_share):
             if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
-            # An edge beside a line that has, within its scatter, the usual and its steady width.
-            apart = abs(width - usual)
-            if not np.isnan(widths.steady[k, c]):
-                apart = max(apart, abs(width - widths.steady[k, c]))
-            own2 = PER_WIDTH**2 * (apart * apart + sigma * sigma)
-            sigma2[k, c] += max(edge2, min(widths.history.passing2[c // BLOCK_COLUMNS + 1], own2))
+            passing2 = widths.history.passing2[c // BLOCK_COLUMNS + 1]
+            if passing2 > edge2:
+                # A line that has, within its scatter, the usual and its steady width is beside it.
+                apart = abs(width - usual)
+                if not np.isnan(widths.steady[k, c]):
+                    apart = max(apart, abs(width - widths.steady[k, c]))
+                edge2 = max(edge2, min(passing2, PER_WIDTH**2 * (apart * apart + sigma * sigma)))
+            sigma2[k, c] += edge2
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
