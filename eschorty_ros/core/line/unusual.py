@@ -289,7 +289,8 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
     """Return the variance of a ``row`` whose line has changed its width at an edge, px squared.
 
     An edge leaves one end of the line where it is, so that the row moves with the width: since it
-    was steady or, where it has not been so yet, since the last profile. Else the variance is 0.
+    was steady or, where it has not been so yet, since the last profile. Half of that, to twice,
+    counts, as rows and widths are smoothed differently. Else the variance is 0.
     """
     width, usual = widths.static_width[k, c], widths.usual.median.width
     same_width, same = widths.same_width, widths.same
