@@ -62,9 +62,9 @@ class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
-    ``jitter2`` the variance of rows that jump forth and back. The ``same_width`` has
-    been the same for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last
-    that was for some.
+    ``jitter2`` the variance of rows that jump forth and back. The ``same_width`` has been the same
+    for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last that was for
+    some.
     """
 
     row: NDArray[np.float64]

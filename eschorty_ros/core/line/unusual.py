@@ -150,17 +150,15 @@ def _update(widths, columns):
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
     usual, history = widths.usual, widths.history
-    recent, polarities = history.recent, history.polarities
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
-    recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
-    recent.jitter2[:], recent.same_width[:], recent.steady_width[:] = 0.0, 0.0, 0.0
-    recent.same[:], recent.before[:] = 0.0, 0.0
-    polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
-    polarities.apart[:], polarities.apart2[:], polarities.all_columns[:] = 0.0, 0.0, 0.0
+    for values in history.recent:
+        values[:] = 0.0
+    for values in history.polarities:
+        values[:] = 0.0
     widths.below[:] = 0.0
-    history.passing2[:], history.shift_px[:] = 0.0, 0.0
+    history.step_px[:], history.passing2[:], history.shift_px[:] = 0.0, 0.0, 0.0
     _update(widths, widths.smoothed.shape[1])
 
 
@@ -313,6 +311,22 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
     return (PER_WIDTH * (width - usual)) ** 2 if at_edge else 0.0
 
 
+@kernel
+def _passing_variance(widths, k, c, sigma_width):
+    """Return the variance of a row near an edge that passes its block of columns, px squared.
+
+    It is beside a line that has, within its scatter, the usual and its steady width.
+    """
+    passing2 = widths.history.passing2[c // BLOCK_COLUMNS + 1]
+    if passing2 == 0.0:
+        return 0.0
+    width, steady = widths.static_width[k, c], widths.steady[k, c]
+    apart = abs(width - widths.usual.median.width)
+    if not np.isnan(steady):
+        apart = max(apart, abs(width - steady))
+    return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
+
+
 @kernel(_nrt=False)
 def _mark_unusual(rows, smoothing, few, lit_share):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
@@ -332,11 +346,9 @@ def _mark_unusual(rows, smoothing, few, lit_share):
             row2, limit2 = sigma2[k, c], _MARKED**2 * rows.sigma2[k, c]
             sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
-            if np.isnan(width) or rows.truncated[k, c]:
-                widths.same_width[k, c] = np.nan
-                continue
             events = rows.events[k, c]
-            if few <= events < smoothing.isolation_events:
+            weak = few <= events < smoothing.isolation_events
+            if np.isnan(width) or rows.truncated[k, c] or weak:
                 widths.same_width[k, c] = np.nan
                 continue
             if events < few:
@@ -360,14 +372,7 @@ def _mark_unusual(rows, smoothing, few, lit_share):
             if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
-            passing2 = widths.history.passing2[c // BLOCK_COLUMNS + 1]
-            if passing2 > edge2:
-                # A line that has, within its scatter, the usual and its steady width is beside it.
-                apart = abs(width - usual)
-                if not np.isnan(widths.steady[k, c]):
-                    apart = max(apart, abs(width - widths.steady[k, c]))
-                edge2 = max(edge2, min(passing2, PER_WIDTH**2 * (apart * apart + sigma * sigma)))
-            sigma2[k, c] += edge2
+            sigma2[k, c] += max(edge2, _passing_variance(widths, k, c, sigma))
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)

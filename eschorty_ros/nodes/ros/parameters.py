@@ -195,8 +195,9 @@ class Parameters(Mapping[str, Any]):
         declared = self._table.get(parameter.name)
         if declared is None:
             return parameter
-        value = declared.converted(parameter.value)
-        return parameter if value is parameter.value else Parameter(parameter.name, value=value)
+        given = parameter.value
+        value = declared.converted(given)
+        return parameter if value is given else Parameter(parameter.name, value=value)
 
     def _validate(self, proposed: Sequence[Parameter[Any]]) -> SetParametersResult:
         changes = {p.name: p.value for p in proposed if p.name in self._table}
