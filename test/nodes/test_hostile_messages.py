@@ -46,8 +46,6 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             for name in NODES:
                 bench.observer.wait_for_answers(name, scenarios.SCAN_DEADLINE_S)
             yield bench, running, Contact(bench.observer)
-            for name, process in running.items():
-                print(f"--- {name}\n{process.end_of_output}")
 
 
 def test_nodes_without_devices_outlast_everything(instrument):

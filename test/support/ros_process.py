@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import rclpy
 import waiting
@@ -73,8 +73,11 @@ class Remap(str):
 class NodeProcess:
     """A module with one node, as a process of its own until ``kill`` or the end of a ``with``.
 
-    Start it in the main thread: it ends with the thread that started it.
+    Start it in the main thread: it ends with the thread that started it. The report of a test
+    that fails shows the end of its output.
     """
+
+    known: ClassVar[list[NodeProcess]] = []
 
     def __init__(
         self, module: str, parameters: Mapping[str, Any], *, domain: int, file: Path | None = None
@@ -97,6 +100,8 @@ class NodeProcess:
             env=domain_environment(domain),
             process_group=0,
         )
+        self._killed_with: str | None = None
+        self.known.append(self)
 
     def __enter__(self) -> NodeProcess:
         return self
@@ -111,6 +116,8 @@ class NodeProcess:
     @property
     def output(self) -> str:
         """Everything the process has printed."""
+        if self._killed_with is not None:
+            return self._killed_with
         return Path(self._log.name).read_text(errors="replace")
 
     @property
@@ -149,6 +156,7 @@ class NodeProcess:
         if self.running():
             self._process.kill()
         self._process.wait()
+        self._killed_with = self.output
         self._log.close()
 
 

@@ -46,7 +46,7 @@ def live(tmp_path_factory):
     )
     domain = free_domain()
     with (
-        NodeProcess(NODES.format("reconstruction"), RECONSTRUCTION, domain=domain) as node,
+        NodeProcess(NODES.format("reconstruction"), RECONSTRUCTION, domain=domain),
         Observer(domain) as observer,
     ):
         topics = {
@@ -63,25 +63,22 @@ def live(tmp_path_factory):
             )
         }
         wait_until(lambda: topics["reconstruction/state"], "the node's state")
-        try:
-            replay(recording, 1.0, domain)
-            wait_until(lambda: topics["scan/points"], "scan/points")
-            seen = len(topics["/diagnostics"])
-            wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")
-            # DDS repeats a burst's lost end only after its heartbeat's 3 s.
-            wait_until(
-                lambda: topics["/tf"][-1].transforms[0].transform.translation.y > 0.04999,
-                "the last /tf",
-            )
-            yield SimpleNamespace(
-                topics={name: list(messages) for name, messages in topics.items()},
-                growing=topics,
-                observer=observer,
-                recording=recording,
-                expected=reconstruct_recording(recording).points,
-            )
-        finally:
-            print(node.output)
+        replay(recording, 1.0, domain)
+        wait_until(lambda: topics["scan/points"], "scan/points")
+        seen = len(topics["/diagnostics"])
+        wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")
+        # DDS repeats a burst's lost end only after its heartbeat's 3 s.
+        wait_until(
+            lambda: topics["/tf"][-1].transforms[0].transform.translation.y > 0.04999,
+            "the last /tf",
+        )
+        yield SimpleNamespace(
+            topics={name: list(messages) for name, messages in topics.items()},
+            growing=topics,
+            observer=observer,
+            recording=recording,
+            expected=reconstruct_recording(recording).points,
+        )
 
 
 def replay(recording, rate, domain):

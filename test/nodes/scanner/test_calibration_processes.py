@@ -168,8 +168,6 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Instrument]
     ):
         bench = CalibrationBench(observer, domain, log, folder)
         yield Instrument(bench, running, emulated, bench_folder)
-        for name, process in running.items():
-            print(f"--- {name}\n{process.end_of_output}")
 
 
 @pytest.fixture

@@ -45,8 +45,6 @@ def instrument(tmp_path_factory):
         scenarios.bench(domain, log) as bench,
     ):
         yield bench, running, relay
-        for name, process in running.items():
-            print(f"--- {name}\n{process.end_of_output}")
 
 
 def test_a_scan_with_metavision_driver_and_five_percent_of_the_heartbeats_lost(instrument):

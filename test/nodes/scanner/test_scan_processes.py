@@ -33,8 +33,6 @@ def instrument(tmp_path_factory):
         scenarios.bench(domain, log) as bench,
     ):
         yield bench, running, scenarios.node_parameters(folder)
-        for name, process in running.items():
-            print(f"--- {name}\n{process.end_of_output}")
 
 
 def started(module, instrument):

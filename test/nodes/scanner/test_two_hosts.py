@@ -37,13 +37,11 @@ def instrument(tmp_path_factory):
         _, folder = ending.enter_context(remote_bench(**scenarios.bench_settings(log)))
         nodes = list(scenarios.node_parameters(folder).items())
         with hosts.on("a"):
-            devices = ending.enter_context(processes(dict(nodes[:DEVICES]), DOMAIN))
+            ending.enter_context(processes(dict(nodes[:DEVICES]), DOMAIN))
         with hosts.on("b"):
-            others = ending.enter_context(processes(dict(nodes[DEVICES:]), DOMAIN))
+            ending.enter_context(processes(dict(nodes[DEVICES:]), DOMAIN))
             bench = ending.enter_context(scenarios.bench(DOMAIN, log))
         yield bench, hosts
-        for name, process in (devices | others).items():
-            print(f"--- {name}\n{process.end_of_output}")
 
 
 @pytest.mark.parametrize("lost", [0.01, 0.05])
