@@ -13,7 +13,8 @@ class SlowDecoder:
         self.counts: Counter[str] = Counter()
         self.high: int | None = None
         self.wrapped = self.low = self.newest = 0
-        self.waiting: int | None = None
+        self.waiting: list[int] | None = None
+        self.bad_before = 0
         self.row: int | None = None
         self.base: int | None = None
         self.polarity = 0
@@ -23,6 +24,11 @@ class SlowDecoder:
     @property
     def now(self) -> int:
         return max(self.newest, self.wrapped + (self.high or 0) * 4096 + self.low)
+
+    @property
+    def bad_words(self) -> int:
+        names = "unknown_words", "legacy_y_words", "broken_triples", "broken_continuations"
+        return sum(self.counts[name] for name in names)
 
     def feed(self, words: list[int]) -> None:
         for word in words:
@@ -146,11 +152,16 @@ class SlowDecoder:
             if ahead:
                 self.wrapped += (1 << 24) * (q < self.high)
                 self.high, self.low = q, 0
-        elif waiting is not None and (q - waiting) % 4096 <= 100:
-            self.move(waiting)
-            if q != waiting:
-                self.wrapped += (1 << 24) * (q < waiting)
-                self.high, self.low = q, 0
+        elif (
+            waiting is not None
+            and (q - waiting[-1]) % 4096 <= 25
+            and self.bad_words == self.bad_before
+        ):
+            self.low *= q == waiting[-1]
+            self.waiting = [*waiting, q]
+            if len(self.waiting) == 3:
+                self.move(q)
+                self.waiting = None
         else:
             self.counts["time_high_dropped"] += waiting is not None
             if ahead >= 4093:
@@ -158,5 +169,5 @@ class SlowDecoder:
                 self.wrapped -= (1 << 24) * (q > self.high)
                 self.high = q
             else:
-                self.waiting = q
+                self.waiting, self.bad_before = [q], self.bad_words
             self.low = 0

@@ -36,9 +36,9 @@ class Counters:
     legacy_y_words: int = 0
     time_high_back: int = 0
     time_high_jumps: int = 0
-    """Forward jumps of more than 12 ms that the next TIME_HIGH confirmed."""
+    """Forward jumps of more than 12 ms that the next two TIME_HIGH confirmed."""
     time_high_dropped: int = 0
-    """Those that it did not confirm."""
+    """Those that they did not confirm."""
     time_low_back: int = 0
     """TIME_LOW below the time of an event already returned; time was held."""
     others_words: int = 0

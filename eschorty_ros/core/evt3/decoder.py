@@ -44,7 +44,8 @@ class Decoder:
 
     A TIME_HIGH that changed zeroes the low bits, a repeated one keeps them. A step back by more
     than half the range is a wrap; time never falls. A jump of more than 12 ms either way counts
-    only when the next TIME_HIGH confirms it. Nothing is emitted before the first TIME_HIGH.
+    only when the next two TIME_HIGH confirm it and no word between them is broken. Nothing is
+    emitted before the first TIME_HIGH.
 
     - ``width``, ``height``: Sensor size in pixels, 1 to 2048. Events outside are dropped and
       counted.

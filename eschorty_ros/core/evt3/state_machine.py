@@ -21,13 +21,16 @@ from eschorty_ros.core.evt3.counters import COUNTS
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS
 
 _TIME_HIGH_STEP_MAX = 3
-"""Largest step of TIME_HIGH (4096 us each) taken without a second word confirming it.
+"""Largest step of TIME_HIGH (4096 us each) taken without others confirming it.
 
 A sensor sends every step. A flipped bit puts time off by this much at most.
 """
 
-_CONFIRMING_STEP_MAX = 100
-"""Largest step from a TIME_HIGH that awaits confirmation to one that confirms it."""
+_CONFIRMING_STEP_MAX = 25
+"""Largest step between TIME_HIGH words that confirm each other."""
+
+_CONFIRMATIONS = 2
+"""TIME_HIGH words that confirm a larger step: of random bytes one in 160 confirms another."""
 
 _NO_ROW = -1
 _NO_BASE = 1 << 20
@@ -42,6 +45,8 @@ _STATE = (
     "high",  # payload of the last TIME_HIGH
     "low",  # payload of the last TIME_LOW
     "held_high",  # TIME_HIGH that awaits confirmation, -1 for none
+    "held_confirmed",  # words that have confirmed it
+    "held_broken",  # broken words before it
     "t_us",  # current time
     "floor_us",  # time of the newest event; time never falls below it
     "row",
@@ -144,11 +149,33 @@ def _jump(s, c, q):
 
 
 @kernel
+def _broken(c):
+    """Return the number of words that no sensor sends where they are."""
+    return c.unknown_words + c.legacy_y_words + c.broken_triples + c.broken_continuations
+
+
+@kernel
+def _hold(s, c, q):
+    """Hold TIME_HIGH ``q`` for those that follow to confirm it."""
+    s.held_high = q
+    s.held_confirmed = 0
+    s.held_broken = _broken(c)
+    s.low = 0
+
+
+@kernel
+def _confirms(s, c, q):
+    """Return whether TIME_HIGH ``q`` confirms the one held: near after it, nothing broken since."""
+    near = ((q - s.held_high) & 4095) <= _CONFIRMING_STEP_MAX
+    return s.held_high >= 0 and near and _broken(c) == s.held_broken
+
+
+@kernel
 def _time_high(s, c, q, floor):
     """Apply TIME_HIGH ``q``; return the new current time, never below ``floor``.
 
     A word that steps back by up to 12 ms (events out of order) is followed with time held. One
-    that is further off waits in ``held_high`` for the next to confirm it: a lone outlier would
+    that is further off waits in ``held_high`` for the next ones to confirm it: an outlier would
     otherwise freeze a clamped clock until real time catches up.
     """
     if s.run != _RUNNING:
@@ -161,33 +188,29 @@ def _time_high(s, c, q, floor):
         s.run = _RUNNING
         return max(floor, s.epoch_us)
     step = (q - s.high) & 4095
-    held = s.held_high
-    s.held_high = -1
-    if step <= _TIME_HIGH_STEP_MAX:
-        if held >= 0:
-            c.time_high_dropped += 1
-        if step:
-            s.epoch_us += step << 12
-            s.high = q
-            s.low = 0
-    elif held >= 0 and ((q - held) & 4095) <= _CONFIRMING_STEP_MAX:
-        low = s.low
-        _jump(s, c, held)
-        if q == held:
-            s.low = low
-        else:
-            s.epoch_us += ((q - held) & 4095) << 12
-            s.high = q
-    else:
-        if held >= 0:
-            c.time_high_dropped += 1
-        if step >= 4096 - _TIME_HIGH_STEP_MAX:
-            c.time_high_back += 1
-            s.epoch_us -= (4096 - step) << 12
-            s.high = q
-        else:
-            s.held_high = q
+    if step > _TIME_HIGH_STEP_MAX and _confirms(s, c, q):
+        low = s.low if q == s.held_high else 0
+        s.held_high = q
+        s.held_confirmed += 1
+        if s.held_confirmed == _CONFIRMATIONS:
+            _jump(s, c, q)
+            s.held_high = -1
+        s.low = low
+        return max(floor, s.epoch_us + s.low)
+    if s.held_high >= 0:
+        c.time_high_dropped += 1
+        s.held_high = -1
+    if 0 < step <= _TIME_HIGH_STEP_MAX:
+        s.epoch_us += step << 12
+        s.high = q
         s.low = 0
+    elif step >= 4096 - _TIME_HIGH_STEP_MAX:
+        c.time_high_back += 1
+        s.epoch_us -= (4096 - step) << 12
+        s.high = q
+        s.low = 0
+    elif step > 0:
+        _hold(s, c, q)
     return max(floor, s.epoch_us + s.low)
 
 

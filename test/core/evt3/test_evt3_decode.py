@@ -58,10 +58,14 @@ KNOWN = [
         "8800 6001 002A 2805 8000 2806 8800 6002 2807",
         [(8388609, 5, 42, 1), (8388609, 6, 42, 1), (8388610, 7, 42, 1)],
     ),
-    # A forward jump counts once the next TIME_HIGH confirms it.
+    # A forward jump counts once the next two TIME_HIGH confirm it, and nothing is broken between.
     (
         "8001 002A 2805 8400 6005 2806 8400 2807 8401 2808",
-        [(4096, 5, 42, 1), (4101, 6, 42, 1), (4194309, 7, 42, 1), (4198400, 8, 42, 1)],
+        [(t, y, 42, 1) for t, y in ((4096, 5), (4101, 6), (4101, 7), (4198400, 8))],
+    ),
+    (
+        "8001 6005 002A 2805 8400 8400 9000 8401 6006 2806 8002 2807",
+        [(4101, 5, 42, 1), (4102, 6, 42, 1), (8192, 7, 42, 1)],
     ),
     # Disorder of a few us around a TIME_HIGH and around the wrap: time stands, never jumps.
     (
@@ -111,7 +115,8 @@ def test_others_and_sensor_drop_words() -> None:
         ("8000 9123 B000 C000 D000", {"unknown_words": 4}),
         ("8005 8003 6001 002A 2001", {"time_high_back": 1}),
         ("8005 8400 8006", {"time_high_dropped": 1, "time_high_jumps": 0}),
-        ("8005 8400 8400", {"time_high_dropped": 0, "time_high_jumps": 1}),
+        ("8005 8400 8400 8401", {"time_high_dropped": 0, "time_high_jumps": 1}),
+        ("8005 8400 8400 8006", {"time_high_dropped": 1, "time_high_jumps": 0}),
         ("8000 6005 002A 2805 6004 2805", {"time_low_back": 1, "events": 2}),
     ],
 )
@@ -297,3 +302,19 @@ def test_a_flipped_bit_of_a_time_word_is_forgotten_within_20_ms(bit: int) -> Non
     assert len(found) == t_us.size
     wrong = found.t != t_us
     assert not wrong[(t_us < flipped_us) | (t_us >= flipped_us + 20_000)].any()
+
+
+@pytest.mark.parametrize("size", [1000, 100_000])
+def test_time_outlasts_a_stretch_of_random_bytes(size: int) -> None:
+    seed = 3
+    print(f"seed {seed}")
+    rng = np.random.default_rng(seed)
+    t_us = np.arange(2_000_000, 3_000_000, 2)
+    ones = np.ones(t_us.size, np.int64)
+    sent = bytearray(evt3.Encoder().encode(t_us, ones, ones, ones))
+    begin = len(sent) // 4
+    sent[begin : begin + size] = rng.bytes(size)
+    found = evt3.Decoder().decode(bytes(sent))
+    # The events behind the stretch come last, and from 20 ms after it on each has its time.
+    behind = t_us[t_us > t_us[-1] - 500_000]
+    assert np.array_equal(found.t[-behind.size :], behind)
