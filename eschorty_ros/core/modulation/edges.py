@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +18,15 @@ EDGES_MAX = 1 << 14
 _JUMP_PERIODS = 4096  # longer gaps are skipped in one step
 _TOLERANCE_SHARE = 4  # a trigger belongs to an edge within this part of the period
 _MISSING_SHARE = Fraction(1, 4)  # of a first profile that may be missing
-_MISSED_MAX = 3  # after as many edges without a trigger any trigger sets a new phase
+_MISSED_MAX = 3  # after as many edges without a trigger two triggers set a new phase
+_NO_TRIGGER_US = -(1 << 61)
 
 
 class _State(NamedTuple):
-    """The last edge: ``step`` periods after the anchor, ``elapsed_us`` and a remainder."""
+    """The last edge: ``step`` periods after the anchor, ``elapsed_us`` and a remainder.
+
+    ``lone_us`` is the last trigger that set no edge, for the next one to agree with.
+    """
 
     anchor_us: int = 0
     step: int = 0
@@ -31,6 +36,7 @@ class _State(NamedTuple):
     last_us: int = 0
     triggered: bool = False
     missed: int = 0
+    lone_us: int = _NO_TRIGGER_US
 
 
 class _Counts(NamedTuple):
@@ -78,9 +84,11 @@ class EdgeSchedule:
 
     A rising trigger within a quarter of a period of the predicted edge replaces it and becomes the
     new anchor. Where a trigger is missing the prediction is used, but only after that quarter has
-    passed. Triggers elsewhere are counted as spurious, unless three edges in a row went missing:
-    then the next trigger sets a new phase. Events are never assigned to a period before its limits
-    are certain, so the result does not depend on when data arrive.
+    passed. Triggers elsewhere are counted as spurious. At first, and where three edges in a row
+    went missing, two successive triggers set the phase that are one or two periods apart: the laser
+    sends more than one, a motor's noise on an open input does not repeat at its period. Events are
+    never assigned to a period before its limits are certain, so the result does not depend on when
+    data arrive.
 
     - ``every``: Return only each ``every``-th edge; 0 while that is not known, until ``anchor``.
 
@@ -116,6 +124,15 @@ class EdgeSchedule:
         """Counts by name."""
         return self._counts._asdict()
 
+    def first_pair_us(self, end_us: int) -> int | None:
+        """Return the first trigger that the next one, up to ``end_us``, shows to be the laser's."""
+        known = self._triggers_us[: np.searchsorted(self._triggers_us, end_us, "right")]
+        tolerance_us = _tolerance_us(self._parts)
+        for trigger_us, next_us in pairwise(known.tolist()):
+            if _agree(trigger_us, next_us, self._parts, tolerance_us):
+                return int(trigger_us)
+        return None
+
     @property
     def first_trigger_us(self) -> int | None:
         """Earliest trigger not used yet."""
@@ -145,15 +162,19 @@ class EdgeSchedule:
         """Append rising edges of the trigger input, in time order."""
         self._triggers_us = np.concatenate([self._triggers_us, t_us])
 
-    def anchor(self, edge_us: int, start_us: int) -> None:
+    def anchor(self, edge_us: int, start_us: int, triggered: bool = False) -> None:
         """Fix the phase by an edge at ``edge_us`` and begin with the last edge until ``start_us``.
+
+        With ``triggered`` it is the first of two triggers that agree.
 
         With ``every`` > 1 it is the last one whose index is a multiple of it. It is the next one
         where more than `_MISSING_SHARE` of that profile is over: in what is left of it anything
         follows the laser.
         """
         every = self._parts.every
-        self._state = _State(anchor_us=edge_us)
+        self._state = _State(anchor_us=edge_us, triggered=triggered)
+        locks = self._counts.phase_locks + triggered
+        self._counts = self._counts._replace(phase_locks=locks)
         first = (self._step_at(start_us) // every) * every
         if start_us - self._edge_us(first) > _MISSING_SHARE * every * self._period:
             first += every
@@ -181,7 +202,7 @@ class EdgeSchedule:
         """Return the watermark that makes everything up to ``newest_us`` certain, nothing later."""
         if not self.triggered:
             return newest_us + 1
-        return newest_us + 1 + max((self._parts.quotient_us + 1) // _TOLERANCE_SHARE, 1)
+        return newest_us + 1 + int(_tolerance_us(self._parts))
 
     def advance(self, watermark_us: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the edges certain now and their indices: views valid until the next call.
@@ -246,11 +267,25 @@ def _rounded(quotient, remainder, denominator):
 
 
 @entry_kernel
+def _tolerance_us(period):
+    """Return the largest distance of a trigger from the edge that it belongs to."""
+    return max((period.quotient_us + 1) // _TOLERANCE_SHARE, 1)
+
+
+@entry_kernel
+def _agree(trigger_us, next_us, period, tolerance_us):
+    """Return whether two triggers are one period apart, or two."""
+    apart_us = next_us - trigger_us
+    periods = 1 + (2 * apart_us > 3 * period.quotient_us)
+    return abs(apart_us - periods * period.quotient_us) <= tolerance_us
+
+
+@entry_kernel
 def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indices):
     """Write the edges that are certain once everything before the watermark is known."""
-    anchor_us, step, at_us, remainder, index, last_us, triggered, missed = state
+    anchor_us, step, at_us, remainder, index, last_us, triggered, missed, lone_us = state
     used, spurious, bridged, locks = counts
-    tolerance_us = max((period.quotient_us + 1) // _TOLERANCE_SHARE, 1)
+    tolerance_us = _tolerance_us(period)
     n = 0
     taken = 0
     safe_us = watermark_us
@@ -273,6 +308,13 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
                 spurious += 1
                 continue
             if not locked:
+                before_us, lone_us = lone_us, edge_us
+                spurious += 1
+                if not _agree(before_us, edge_us, period, tolerance_us):
+                    continue
+                lone_us = np.int64(_NO_TRIGGER_US)
+                spurious -= 2
+                used += 1
                 locks += 1
             used += 1
             triggered = True
@@ -297,5 +339,5 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
             edges_us[n] = edge_us
             indices[n] = index
             n += 1
-    state = anchor_us, step, at_us, remainder, index, last_us, triggered, missed
+    state = anchor_us, step, at_us, remainder, index, last_us, triggered, missed, lone_us
     return _Advance(n, taken, safe_us, state, (used, spurious, bridged, locks))

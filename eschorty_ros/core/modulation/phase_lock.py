@@ -87,10 +87,10 @@ class PhaseLock:
             t, _, _, p = held.arrays
             begin = held.searched
             window = estimation_window(t[begin:], now_us, self._modulation)
-            trigger_us = self.schedule.first_trigger_us
             end_us = END_OF_STREAM_US if window is None else window.end_us
-            if trigger_us is not None and trigger_us <= end_us:
-                self.schedule.anchor(trigger_us, min(first_us, trigger_us))
+            trigger_us = self.schedule.first_pair_us(end_us)
+            if trigger_us is not None:
+                self.schedule.anchor(trigger_us, min(first_us, trigger_us), triggered=True)
                 return True
             if window is None:
                 break

@@ -12,6 +12,7 @@ from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction.stream_faults import is_unreadable
 from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import between
@@ -298,7 +299,8 @@ def _few_points(
     settings: Settings, counters: Mapping[str, int], points: Points, dark: str, modulated: bool
 ) -> list[str]:
     """Return the largest loss where it left few points or none, ``dark`` where there is none."""
-    if 2 * max(counters["events_gated"], counters["events_outside_roi"]) > counters["events"]:
+    outside = 2 * max(counters["events_gated"], counters["events_outside_roi"])
+    if outside > counters["events"] or is_unreadable(counters):
         # The reconstructor has a line for it.
         return []
     lost = max(_LOSSES, key=lambda name: counters[name])

@@ -49,11 +49,11 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         return found
     used, bridged = counts["triggers_used"], counts["edges_bridged"]
     edges = used + counts["triggers_spurious"]
-    if max(bridged, edges - used) > used > 0:
+    if max(bridged, edges - used) > used:
+        without = f" and {bridged} periods begin without one" if bridged else ""
         found.append(
-            f"the trigger input has {edges} edges in {used + bridged} periods, and {used} of them "
-            "begin profiles; where they are not the laser's, set trigger_source to what the input "
-            "is wired to, or to none"
+            f"{used} of {edges} edges at the trigger input begin a period{without}; where they are "
+            "not the laser's, set trigger_source to what the input is wired to, or to none"
         )
     for name, what in _TIME_FAULTS.items():
         jumps = counts[name] - counts["decoder_gaps"]

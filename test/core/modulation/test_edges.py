@@ -59,7 +59,7 @@ def test_triggers_replace_predictions_and_missing_ones_are_bridged():
     missing = [10, 11, 30]
     schedule = EdgeSchedule(Modulation(1000.0))
     schedule.add_triggers(np.delete(true_us, missing))
-    schedule.anchor(int(true_us[0]), int(true_us[0]))
+    schedule.anchor(int(true_us[0]), int(true_us[0]), triggered=True)
     edges, indices = collect(schedule, int(true_us[-1]) + 100, pieces=7)
     assert len(edges) == 60
     assert (np.diff(indices) == 1).all()
@@ -79,6 +79,20 @@ def test_spurious_trigger_is_ignored_and_a_new_phase_is_taken_after_three_misses
     assert np.isin(after[4:], edges).all()
     assert schedule.counters["triggers_spurious"] >= 1
     assert (np.diff(edges) > 0).all()
+
+
+def test_triggers_that_come_now_and_then_set_no_phase():
+    """As a motor's noise on an open input: none comes one or two periods after another."""
+    rng = np.random.default_rng(SEED)
+    print(f"seed {SEED}")
+    noise_us = np.cumsum(rng.integers(3000, 20_000, 30))
+    schedule = EdgeSchedule(Modulation(1000.0))
+    schedule.add_triggers(noise_us)
+    assert schedule.first_pair_us(10**6) is None
+    schedule.anchor(0, 0)
+    edges, _ = collect(schedule, int(noise_us[-1]) + 1000, pieces=9)
+    assert (edges % 1000 == 0).all()
+    assert schedule.counters["triggers_spurious"] == noise_us.size
 
 
 @pytest.mark.parametrize("late_us", [-40, 40])
