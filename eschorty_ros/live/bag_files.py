@@ -200,10 +200,12 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        whole = False
         try:
             self._writer.close()
+            whole = kind is None
         finally:
-            if kind is not None:
+            if not whole:
                 # Half a bag would look complete.
                 shutil.rmtree(self._path, ignore_errors=True)
 

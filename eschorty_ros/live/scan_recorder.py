@@ -229,6 +229,8 @@ class ScanRecorder:
         )
         try:
             if writer is None:
+                with contextlib.suppress(OSError):
+                    self.folder.rmdir()
                 self._failure = self._failure or "no packet came"
                 return
             with self._noted():

@@ -86,6 +86,19 @@ def test_an_interrupted_conversion_leaves_no_bag(tmp_path, source):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_disk_that_is_full_at_the_end_leaves_no_bag(tmp_path, source, monkeypatch):
+    close_fully = Writer.close
+
+    def close(writer):
+        close_fully(writer)
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Writer, "close", close)
+    with pytest.raises(EschortyError, match="no space"):
+        recording_to_bag(source, tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
 def test_a_stage_in_unix_time_gives_no_bag(tmp_path, source):
     samples = source.stage_samples.copy()
     samples["t_us"] += 1_700_000_000_000_000

@@ -25,7 +25,7 @@ class PacketPublisher:
     - ``packets``, ``published_bytes``, ``unsubscribed_bytes``: Packets and bytes published, and
       bytes without a subscriber.
     - ``late_s``: Time by which the newest chunk waited for publication, or an emulated camera is
-      late.
+      late; 0 once none waits.
     - ``on``, ``off``: Events by polarity, published or not.
     """
 
@@ -78,6 +78,7 @@ class PacketPublisher:
     def push(self, chunk: EventChunk | None, now_ns: int) -> None:
         """Publish the packets that are due; ``None`` is a wait without data."""
         if chunk is None:
+            self.late_s = 0.0
             self._publish(self._packetizer.push(b"", now_ns))
             return
         if chunk.gap or chunk.restarted:

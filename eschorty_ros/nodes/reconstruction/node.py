@@ -88,7 +88,6 @@ class ReconstructionNode(Node):
         finally:
             slow.cancel()
         self._override = modulation_override(self.parameters)
-        self._record_named = ""
         check_record_name(self.parameters["record_name"])
         self._pipeline = Pipeline(
             self.calibration,
@@ -273,11 +272,12 @@ class ReconstructionNode(Node):
         A node that was killed counts as a publisher for some time.
         """
         topics = ["camera/events", "stage/odom", *([] if self._override else ["laser/state"])]
-        faults = [publishers_fault(self, topic) for topic in topics]
+        faults = {topic: publishers_fault(self, topic) for topic in topics}
         silence = self._stage.silence_fault(self, "stage/odom")
-        several = any(self.count_publishers(topic) > 1 for topic in topics)
-        message = "; ".join(fault for fault in (*faults, silence) if fault)
-        return message, several or bool(faults[1] or silence)
+        names = map(self.resolve_topic_name, topics)
+        several = any(self.count_publishers(name) > 1 for name in names)
+        message = "; ".join(fault for fault in (*faults.values(), silence) if fault)
+        return message, several or bool(faults["stage/odom"] or silence)
 
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")
@@ -289,9 +289,10 @@ class ReconstructionNode(Node):
         values = self.parameters
         if not values["record"]:
             return None
-        named, self._record_named = self._record_named, values["record_name"]
-        name = scan_id if named == self._record_named else self._record_named
-        folder = Path(values["record"]).expanduser() / (name or scan_id)
+        parent = Path(values["record"]).expanduser()
+        folder = parent / (values["record_name"] or scan_id)
+        if folder in self._scans.recordings:
+            folder = parent / scan_id
         log = ScanLog(
             scan_id=scan_id,
             start_mm=start_mm,

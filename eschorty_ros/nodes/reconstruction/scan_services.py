@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -49,6 +50,8 @@ class ScanServices:
     - ``stage_timeout_s``: Longest wait of points for the stage after the end.
     - ``publish``: Publishes a finished scan, given the ROS time (ns) for one without points.
     - ``recorder``: Returns a recorder for a scan's log, ``None`` when scans are not recorded.
+
+    Public attribute ``recordings``: Folders of the scans recorded so far.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class ScanServices:
         self._publish = publish
         self._make_recorder = recorder
         self._recorder: ScanRecorder | None = None
+        self.recordings: set[Path] = set()
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
         self._refused: tuple[Any, Any, float] = None, None, -math.inf
@@ -134,6 +138,8 @@ class ScanServices:
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         if response.success:
             self._recorder = recorder
+            if recorder is not None:
+                self.recordings.add(recorder.folder)
         elif recorder is not None:
             recorder.end(None, response.message)
         return response

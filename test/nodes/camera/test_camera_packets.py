@@ -54,3 +54,11 @@ def test_bytes_without_a_subscriber_are_a_gap_after_the_first_packet():
     push(packets, 2)
     assert publisher.seqs == [0, 1, 3, 4]
     assert packets.unsubscribed_bytes == 20
+
+
+def test_a_delay_is_over_once_no_chunk_waits():
+    packets = begun(Publisher())
+    packets.push(EventChunk(b"\0\0", 0), 500_000_000)
+    assert packets.late_s == 0.5
+    packets.push(None, 600_000_000)
+    assert packets.late_s == 0.0

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.srv import BeginScan, EndScan
 from event_camera_msgs.msg import EventPacket
 from nav_msgs.msg import Odometry
-from ros_process import NodeProcess, Observer, nodes_here
+from ros_process import NodeProcess, Observer, Remap, nodes_here
 from std_msgs.msg import Header
 from waiting import wait_until
 
@@ -27,6 +27,24 @@ def devices():
         ),
     ):
         events = observer.publisher(EventPacket, "camera/events", qos.events())
+        odometry = observer.publisher(Odometry, "stage/odom", qos.stream())
+        yield observer, events, odometry
+
+
+@pytest.fixture
+def renamed(tmp_path):
+    """As ``devices``, for another camera driver's topic, with recordings, the first one named."""
+    topic = "/event_camera/events"
+    parameters = {"frequency": 70.0, "record": tmp_path, "record_name": "a"}
+    with (
+        Observer() as observer,
+        NodeProcess(
+            "eschorty_ros.nodes.reconstruction.node",
+            parameters | {"camera/events": Remap(topic)},
+            domain=observer.domain,
+        ),
+    ):
+        events = observer.publisher(EventPacket, topic, qos.events())
         odometry = observer.publisher(Odometry, "stage/odom", qos.stream())
         yield observer, events, odometry
 
@@ -83,6 +101,33 @@ def test_a_second_publisher_is_refused_and_may_be_one_that_was_killed(devices):
         "one is listed for 20 s"
     )
     odometry.publish(sample(observer))
+
+
+def test_a_second_publisher_of_another_topic_may_be_one_that_was_killed(renamed):
+    observer, events, odometry = renamed
+    odometry.publish(sample(observer))
+    observer.node.create_publisher(EventPacket, events.topic_name, qos.events())
+    answer = begin(observer, "two")
+    assert "/event_camera/events has 2 publishers" in answer.message
+    assert answer.retry
+
+
+def test_a_refused_scan_leaves_no_folder_and_its_name_to_the_next(renamed, tmp_path):
+    observer, _, odometry = renamed
+    odometry.publish(sample(observer))
+    used = tmp_path / "a" / "cloud.pcd"
+    used.parent.mkdir()
+    used.touch()
+    assert "is not empty" in begin(observer, "refused").message
+    used.unlink()
+    answer = begin(observer, "good")
+    assert answer.success, answer.message
+    assert "'good' is being collected" in begin(observer, "another").message
+    wait_until(lambda: [path.name for path in tmp_path.iterdir()] == ["a"], "its folder alone")
+    end(observer, "good")
+    answer = begin(observer, "next")
+    assert answer.success, answer.message
+    wait_until(lambda: [path.name for path in tmp_path.iterdir()] == ["next"], "its folder alone")
 
 
 def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
