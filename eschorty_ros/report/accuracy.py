@@ -134,12 +134,10 @@ def lit_columns(
 ) -> NDArray[np.bool_]:
     """Return a mask of the columns whose line is within the rows, shape (positions, columns)."""
     columns = np.arange(model.columns, dtype=np.int64)
-    near_mm, far_mm = model.range_limits_mm
     lit = np.zeros((len(positions_mm), model.columns), dtype=np.bool_)
     for index, position in enumerate(positions_mm):
-        truth = scene.range_mm(np.array([position]), columns, model)[0]
-        with np.errstate(invalid="ignore"):
-            lit[index] = (truth >= near_mm) & (truth <= far_mm)
+        row = model.row(scene.range_mm(np.array([position]), columns, model)[0], columns)
+        lit[index] = (row >= 0.0) & (row <= model.rows - 1.0)
     return lit
 
 
@@ -332,8 +330,7 @@ def measure_recorded(
     nearest = np.where(share < 0.5, first, last)
     expected_mm = np.where(flat, first + np.clip(share, 0.0, 1.0) * (last - first), nearest)
     error_mm = np.where(number >= 0, profiles.range_mm - expected_mm, np.nan)
-    near_mm, far_mm = model.range_limits_mm
-    lit = (true_mm >= near_mm) & (true_mm <= far_mm)
+    lit = np.isfinite(true_mm)
     apart = np.diff(np.unique(profiles.edge_us))
     every = round(float(np.median(apart)) / recording.modulation.period_us) if apart.size else 1
     if every > 1 and (number >= 0).any():

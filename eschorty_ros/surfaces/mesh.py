@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array, file_path, positive
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import folder_beside
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed
@@ -125,14 +126,12 @@ def write_mesh(path: str | os.PathLike[str], made: Mesh) -> None:
         open3d.utility.Vector3iVector(made.triangles.astype(np.int32)),
     )
     shape.compute_vertex_normals()
-    part = Path(target.parent, f".{target.stem}.part{target.suffix.lower()}")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
-    try:
+    with folder_beside(target) as folder:
+        part = folder / f"mesh{target.suffix.lower()}"
         if not open3d.io.write_triangle_mesh(str(part), shape):
             raise ArgumentError(f"cannot write {target}; check folder and disk")
         part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def check_format(path: str | os.PathLike[str]) -> Path:

@@ -126,6 +126,20 @@ def test_columns_out_of_the_sensors_view_are_not_expected():
     assert not lit.any()
 
 
+def test_a_bent_line_is_on_the_sensor_where_its_own_column_is():
+    bent = replace(load_calibration("config_3"), b_prime_1_px=15.0, b_prime_2_px=5.0).model()
+    near_mm = bent.range_limits_mm[0]
+
+    class Near:
+        def range_mm(self, stage_mm, columns, model):
+            return np.full((np.size(stage_mm), np.size(columns)), near_mm + 5.0)
+
+    lit = accuracy.lit_columns(Near(), bent, np.zeros(1))[0]
+    row = bent.row(np.full(bent.columns, near_mm + 5.0), np.arange(bent.columns))
+    np.testing.assert_array_equal(lit, (row >= 0.0) & (row <= bent.rows - 1.0))
+    assert 0 < np.count_nonzero(lit) < bent.columns
+
+
 def test_an_empty_cloud_gives_nan_not_a_crash():
     result = accuracy.measure(np.empty(0, POINT_DTYPE), Wedge(), MODEL, SWEEP)
     assert (result.points, result.completeness) == (0, 0.0)

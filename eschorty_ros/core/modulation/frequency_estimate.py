@@ -112,7 +112,7 @@ class FrequencyEstimate:
         high = round(FREQUENCY_MAX_HZ / step_hz)
         strongest = float(power[low:high].max())
         noise = _LINE_MIN * float(np.median(power[low:high]))
-        if strongest < noise:
+        if strongest <= noise:
             return None
         reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
 

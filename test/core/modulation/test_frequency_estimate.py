@@ -45,6 +45,7 @@ def test_another_light_does_not_hide_the_laser():
 
 def test_events_without_rhythm_show_none():
     assert shown_hz(70.0, NOISE) is None
+    assert shown_hz(70.0, np.arange(0, 2_000_000, 10)) is None
     assert FrequencyEstimate().frequency_hz(70.0) is None
 
 
