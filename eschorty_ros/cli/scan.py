@@ -20,7 +20,8 @@ from eschorty_ros.live.sweep_coverage import PASSES_MAX
 if TYPE_CHECKING:
     from eschorty_ros.nodes.one_process.composition import Tables
     from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
-    from eschorty_ros.report.accuracy import KnownScene, Sweep
+    from eschorty_ros.report.accuracy import Sweep
+    from eschorty_ros.simulation.scenes import Scene
 
 
 @click.command("scan")
@@ -223,7 +224,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         _write_truth(result, seen, sweep)
 
 
-def _write_truth(result: ScanResult, scene: KnownScene, sweep: Sweep) -> None:
+def _write_truth(result: ScanResult, scene: Scene, sweep: Sweep) -> None:
     """Write the scene's ranges to the scan's recording; DeviceError where that is not complete."""
     from eschorty_ros.core.storage import TRUTH_FILE, load_recording, write_truth_csv
     from eschorty_ros.report.accuracy import recorded_truth

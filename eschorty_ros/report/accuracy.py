@@ -9,28 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
-from eschorty_ros.core.storage import TRUTH_DTYPE, Recording
+from eschorty_ros.core.storage import Recording
 from eschorty_ros.surfaces.profiles import profile_begins, profile_index
+
+if TYPE_CHECKING:
+    from eschorty_ros.simulation.scenes import Scene
 
 # Range per stage travel between two periods of one surface.
 _SLOPE_MAX = 2.0
-
-
-class KnownScene(Protocol):
-    """A scene with known ranges; every simulated scene is one."""
-
-    def range_mm(
-        self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
-    ) -> NDArray[np.float64]:
-        """Return ranges in mm, shape (len(stage_mm), len(columns)); NaN without a surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +103,7 @@ def stage_and_range_mm(
 
 
 def true_range_mm(
-    scene: KnownScene,
+    scene: Scene,
     model: RangeModel,
     stage_mm: NDArray[np.float64],
     columns: NDArray[np.integer[Any]],
@@ -130,7 +124,7 @@ def true_range_mm(
 
 
 def lit_columns(
-    scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
+    scene: Scene, model: RangeModel, positions_mm: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Return a mask of the columns whose line is within the rows, shape (positions, columns)."""
     columns = np.arange(model.columns, dtype=np.int64)
@@ -143,7 +137,7 @@ def lit_columns(
 
 def range_error_mm(
     points: NDArray[np.void],
-    scene: KnownScene,
+    scene: Scene,
     model: RangeModel,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> NDArray[np.float64]:
@@ -183,7 +177,7 @@ def complete_periods(
 
 def measure(
     points: NDArray[np.void],
-    scene: KnownScene,
+    scene: Scene,
     model: RangeModel,
     sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
@@ -242,7 +236,7 @@ def _passes(
 
 
 def recorded_truth(
-    points: NDArray[np.void], scene: KnownScene, recording: Recording, sweep: Sweep
+    points: NDArray[np.void], scene: Scene, recording: Recording, sweep: Sweep
 ) -> NDArray[np.void]:
     """Return the scene's ranges at the periods of a recorded scan, by its stage's log.
 
@@ -251,10 +245,11 @@ def recorded_truth(
     - ``points``: The scan's cloud: it shows where the periods are.
     - ``recording``: Of the scan, as the nodes recorded it.
     """
+    from eschorty_ros.simulation.world.truth_log import TruthLog
+
     samples, calibration = recording.stage_samples, recording.calibration
-    model, every = calibration.model(), np.arange(calibration.columns, dtype=np.int64)
     at_mm, t_us = samples["position_mm"], samples["t_us"]
-    parts = [np.empty(0, TRUTH_DTYPE)]
+    log = TruthLog(scene, calibration.model())
     passes = _passes(points, sweep, calibration.stage_direction)
     for number, (_, positions, _) in enumerate(passes):
         for position in positions:
@@ -266,15 +261,8 @@ def recorded_truth(
                 continue
             ends = slice(crossed[0], crossed[0] + 2)
             share = (position - at_mm[ends][0]) / np.diff(at_mm[ends])[0]
-            range_mm = scene.range_mm(np.array([position]), every, model)[0]
-            row = model.row(range_mm, every)
-            with np.errstate(invalid="ignore"):
-                lit = np.flatnonzero((row >= 0.0) & (row <= model.rows - 1.0))
-            part = np.empty(lit.size, TRUTH_DTYPE)
-            part["t_us"] = t_us[ends][0] + round(share * np.diff(t_us[ends])[0])
-            part["column"], part["range_mm"] = lit, range_mm[lit]
-            parts.append(part)
-    return np.concatenate(parts)
+            log.add(t_us[ends][0] + round(share * np.diff(t_us[ends])[0]), position)
+    return log.table()
 
 
 def pass_index(

@@ -13,7 +13,8 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.storage import Recording
-from eschorty_ros.report.accuracy import KnownScene, true_range_mm
+from eschorty_ros.report.accuracy import true_range_mm
+from eschorty_ros.simulation.scenes import Scene
 
 GROSS_PX = 10.0
 """Half the line's full width at half maximum: a row this far off is not on the line."""
@@ -81,7 +82,7 @@ def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
 
 
 def scan_errors(
-    profiles: Profiles, recording: Recording, scene: KnownScene, every: int = 1
+    profiles: Profiles, recording: Recording, scene: Scene, every: int = 1
 ) -> ScanErrors:
     """Compare every point with the scene at its time, and the recording's truth with the points.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import integer, number
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, integer_vector, number
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.line.blinking import Blink
 from eschorty_ros.core.line.centroid import _estimate_columns, empty_rows, make_row_counts
@@ -89,7 +89,8 @@ def estimate(
     >>> found.events
     array([3, 3])
     """
-    row_array = _checked_rows(rows, height)
+    integer("height", height, 1, ROW_LAST + 1)
+    row_array = integer_vector("rows", rows, np.uint32, 0, height - 1)
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
@@ -125,30 +126,11 @@ def estimate(
     return Centroids(row, sigma, width, events, found.ambiguous, truncated)
 
 
-def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:
-    integer("height", height, 1, ROW_LAST + 1)
-    array = np.asarray(rows)
-    if array.ndim != 1 or (array.size and not np.issubdtype(array.dtype, np.integer)):
-        raise ArgumentError(
-            f"rows has shape {array.shape} and dtype {array.dtype}; give one axis of integers"
-        )
-    if array.size and not (array.min() >= 0 and array.max() < height):
-        raise ArgumentError(
-            f"rows span {array.min()} to {array.max()}; the sensor has rows 0 to {height - 1}"
-        )
-    return array.astype(np.uint32)
-
-
 def _checked_offsets(offsets: ArrayLike, size: int) -> NDArray[np.int64]:
-    array = np.asarray(offsets)
-    if array.ndim != 1 or array.size < 1 or not np.issubdtype(array.dtype, np.integer):
+    checked = integer_vector("offsets", offsets, np.int64, 0, TIME_LIMIT)
+    if checked.size < 1 or checked[0] != 0 or checked[-1] != size or (np.diff(checked) < 0).any():
         raise ArgumentError(
-            f"offsets has shape {array.shape} and dtype {array.dtype}; give one axis of integers"
-        )
-    wide = array.astype(np.int64)
-    if wide[0] != 0 or wide[-1] != size or (np.diff(wide) < 0).any():
-        raise ArgumentError(
-            f"offsets run from {wide[0]} to {wide[-1]} for {size} rows; "
+            f"offsets run from {checked[:1]} to {checked[-1:]} for {size} rows; "
             "start at 0, never fall, end at the number of rows"
         )
-    return wide
+    return checked

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
 
@@ -29,8 +28,6 @@ LIVE_SPAN_NS = 4_000_000_000
 """Longest time one live cloud may span, just under the range of its uint32 ``t``."""
 
 _LAYOUTS = {dtype: _live_dtype(dtype) for dtype in (POINT_DTYPE, REFLECTANCE_DTYPE)}
-_WORD = np.dtype(np.uint32)
-_TIME_AT = LIVE_DTYPE.fields["t"][1] // _WORD.itemsize  # type: ignore[index]
 
 
 def live_points(points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
@@ -48,20 +45,6 @@ def live_points(points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) ->
     times_ns = exact("t_ns", t_ns, np.int64, len(points))
     begin_ns = integer("stamp_ns", stamp_ns, -TIME_LIMIT, TIME_LIMIT)
     live = np.empty(len(points), layout)
-    _fill(_words(np.ascontiguousarray(points)), times_ns, begin_ns, _words(live))
+    for name in layout.names or ():
+        live[name] = times_ns - begin_ns if name == "t" else points[name]
     return live
-
-
-def _words(points: NDArray[Any]) -> NDArray[np.uint32]:
-    return points.view(_WORD).reshape(len(points), points.dtype.itemsize // _WORD.itemsize)
-
-
-@entry_kernel
-def _fill(points, t_ns, stamp_ns, live):
-    """Copy points word by word; their time of two words becomes one since the stamp."""
-    for i in range(np.uintp(t_ns.size)):
-        for k in range(_TIME_AT):
-            live[i, k] = points[i, k]
-        live[i, _TIME_AT] = t_ns[i] - stamp_ns
-        for k in range(_TIME_AT + 1, live.shape[1]):
-            live[i, k] = points[i, k + 1]

@@ -301,11 +301,14 @@ def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction:
     Raises ``ArgumentError`` when the positions do not match the points or the direction is not a
     unit vector.
     """
-    _move(points, _positions("position_mm", position_mm, len(points)), _unit(stage_direction))
+    position = _positions("position_mm", position_mm, len(points))
+    for axis, part in zip("xyz", _unit(stage_direction), strict=True):
+        if part:
+            points[axis] += part * position * 1e-3
 
 
 def _positions(name: str, position_mm: ArrayLike, points: int) -> NDArray[np.float64]:
-    """Return one position for each point, for compiled code."""
+    """Return one position for each point."""
     position = reals(name, position_mm)
     if not position.ndim:
         return np.full(points, position)
@@ -313,20 +316,7 @@ def _positions(name: str, position_mm: ArrayLike, points: int) -> NDArray[np.flo
         raise ArgumentError(
             f"{name} has shape {position.shape}; give one position for each of the {points} points"
         )
-    return np.ascontiguousarray(position)
-
-
-@entry_kernel
-def _move(points, position_mm, direction):
-    """Move points along the axes that the stage's direction has a part of."""
-    x, y, z = direction[0], direction[1], direction[2]
-    for i in range(np.uintp(points.size)):
-        if x != 0.0:
-            points[i].x += x * position_mm[i] * 1e-3
-        if y != 0.0:
-            points[i].y += y * position_mm[i] * 1e-3
-        if z != 0.0:
-            points[i].z += z * position_mm[i] * 1e-3
+    return position
 
 
 def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:

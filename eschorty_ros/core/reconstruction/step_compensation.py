@@ -42,7 +42,6 @@ _SIGMA_PX = 0.35
 _REACH_COLUMNS = 2
 """Columns on either side that the median of the widths takes in."""
 
-
 _EVIDENCE_KEPT = 0.7
 """Share of the evidence for the side that the next profile with a step keeps: a stage may turn."""
 
@@ -122,6 +121,8 @@ class StepCompensator:
 
     def _enter(self, profile: LineRows) -> None:
         """Store the widths and rows of one profile at its place in time."""
+        from scipy.ndimage import median_filter
+
         index = int(profile.period[0]) // self._every
         passed = 1 if self._last_index is None else index - self._last_index
         self._last_index = index
@@ -140,7 +141,9 @@ class StepCompensator:
         widths_px[:], line[:] = 0.0, np.nan
         widths_px[profile.column] = self._full_width_px(profile)
         line[profile.column] = profile.row
-        _medians(widths_px, history.medians_px[slot])
+        # Columns without a point count as 0.
+        around = 2 * _REACH_COLUMNS + 1
+        history.medians_px[slot] = median_filter(widths_px, around, mode="nearest")
         self._held.append((self._newest, profile))
 
     def _full_width_px(self, profile: LineRows) -> Array:
@@ -220,26 +223,6 @@ def _between(row_before, row_after):
     return 0.5 * (row_before + row_after)
 
 
-@kernel
-def _median(widths, column, lit_only, scratch):
-    """Return the median of the columns around one; with ``lit_only`` of those with a point."""
-    n = 0
-    first = max(column - _REACH_COLUMNS, 0)
-    for c in range(first, min(column + _REACH_COLUMNS + 1, widths.size)):
-        value = widths[c]
-        if value == 0.0 and lit_only:
-            continue
-        k = n
-        while k > 0 and scratch[k - 1] > value:
-            scratch[k] = scratch[k - 1]
-            k -= 1
-        scratch[k] = value
-        n += 1
-    if n == 0:
-        return 0.0
-    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
-
-
 @entry_kernel
 def _shifts(points, history, number, newest):
     """Write the shift and the difference of each point of profile ``number``.
@@ -249,7 +232,6 @@ def _shifts(points, history, number, newest):
     """
     size = history.present.size
     present = number % size
-    scratch = np.empty(2 * _REACH_COLUMNS + 1)
     for k in range(points.column.size):
         column = np.int64(points.column[k])
         first, last = number - points.lag[k], number + points.lag[k]
@@ -265,16 +247,10 @@ def _shifts(points, history, number, newest):
         row_before, row_after = history.rows[before, column], history.rows[after, column]
         if abs(row_before - row_after) > _ROW_GATE_PX:
             continue
-        width = _median(history.widths_px[present], column, True, scratch)
+        around = slice(max(column - _REACH_COLUMNS, 0), column + _REACH_COLUMNS + 1)
+        near = history.widths_px[present, around]
+        width = np.median(near[near > 0.0])
         shift = _centroid_shift(width_before, width, width_after)
         points.shift_px[k] = shift
         expected = _between(row_before, row_after)
         points.difference_px[k] = history.rows[present, column] - expected
-
-
-@entry_kernel
-def _medians(widths, medians):
-    """Write the median of the columns around each column; those without a point count as 0."""
-    scratch = np.empty(2 * _REACH_COLUMNS + 1)
-    for column in range(widths.size):
-        medians[column] = _median(widths, column, False, scratch)

@@ -10,7 +10,6 @@ from eschorty_ros.core.evt3 import Decoder, Encoder
 from eschorty_ros.core.evt3.cuts import Cut, next_cut
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction.live_cloud import live_points
 from eschorty_ros.core.reconstruction.profiles import place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -38,8 +37,6 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     # With the first piece the phase is known, and the second is decoded straight into columns.
     for piece in (data[: len(data) // 2], data[len(data) // 2 :]):
         reconstructor.push(piece)
-    profiles = reconstructor.flush()
-    points = place(profiles, reconstructor.model, 0.0, calibration.stage_direction)
-    live_points(points, profiles.t_us, 0)
+    place(reconstructor.flush(), reconstructor.model, 0.0, calibration.stage_direction)
     decoder = Decoder(calibration.columns, calibration.rows)
     next_cut(decoder.words(data), Cut(0, 0), np.zeros(1, np.int64), 1, decoder)
