@@ -30,6 +30,7 @@ from streams import line_row_events, sparse_events  # noqa: E402
 from eschorty_ros.core import evt3  # noqa: E402
 from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core.storage.raw_file import RawReader, RawWriter  # noqa: E402
+from eschorty_ros.report.provenance import cpu_model  # noqa: E402
 
 PIECE_BYTES = 128 * 1024
 SEED = 20_240_601
@@ -121,15 +122,6 @@ def seconds(batches: Callable[[], Iterator[Batch]]) -> float:
     return time.process_time() - began
 
 
-def cpu_name() -> str:
-    """Return the name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((ln.split(":", 1)[1].strip() for ln in lines if ln.startswith("model name")), "?")
-
-
 def version(package: str) -> str | None:
     """Return the installed version, ``None`` when absent."""
     try:
@@ -181,7 +173,7 @@ def main() -> int:
     arguments = parser.parse_args()
     names = ("numpy", "numba", "evt3", "evutils", "expelliarmus")
     print(
-        f"CPU: {cpu_name()}; Python {platform.python_version()}; "
+        f"CPU: {cpu_model()}; Python {platform.python_version()}; "
         + "; ".join(
             f"{name} {version(name) or 'absent (pip install -r benchmark/requirements.txt)'}"
             for name in names

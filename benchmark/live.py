@@ -32,10 +32,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from reconstruct import CALIBRATION, cpu_name
+from reconstruct import CALIBRATION
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.report.provenance import cpu_model
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 
@@ -260,7 +261,7 @@ def main() -> None:
         publish(arguments)
         return
     reliability = "reliable" if arguments.reliable else "best effort"
-    print(f"{cpu_name()}; Python {platform.python_version()}; numpy {np.__version__}; "
+    print(f"{cpu_model()}; Python {platform.python_version()}; numpy {np.__version__}; "
           f"rclpy {version('rclpy')}; packets {reliability}")  # fmt: skip
     shown = {name: form for name, form in COLUMNS_SHOWN.items() if arguments.soak or name != MINUTE}
     print(*(f"{name:>{int(form.split('.')[0])}}" for name, form in shown.items()))

@@ -39,6 +39,7 @@ from eschorty_ros.core.storage import (
     write_stage_csv,
 )
 from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.report.provenance import cpu_model
 
 HEAD = """# Speed of the reconstruction
 
@@ -226,7 +227,7 @@ def main() -> None:
         return
     cores = len(os.sched_getaffinity(0))
     text = HEAD.format(
-        computer=f"{single.cpu_name()}, {cores} cores, {platform.system()} {platform.machine()}.",
+        computer=f"{cpu_model()}, {cores} cores, {platform.system()} {platform.machine()}.",
         versions=f"Python {platform.python_version()}, numpy {np.__version__}, "
         f"scipy {scipy.__version__}, numba {numba.__version__}.",
         range_m=single.RANGE_MM * 1e-3,

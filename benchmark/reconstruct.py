@@ -16,7 +16,6 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numba
@@ -26,6 +25,7 @@ from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, paper_method
+from eschorty_ros.report.provenance import cpu_model
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 
@@ -45,14 +45,6 @@ CASES = {
     "ours + reflectance": Settings(reflectance="on"),
     "ours + compensation": Settings(reflectance_compensation="on"),
 }
-
-
-def cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), "?")
 
 
 def simulated(modulation: Modulation, seconds: float) -> tuple[bytes, int]:
@@ -159,7 +151,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     print(
-        f"{cpu_name()}; Python {platform.python_version()}, numpy {np.__version__}, "
+        f"{cpu_model()}; Python {platform.python_version()}, numpy {np.__version__}, "
         f"numba {numba.__version__}; seed {SEED}"
     )
     table(70.0, arguments.seconds, arguments.repeats)
