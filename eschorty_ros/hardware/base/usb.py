@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import errno
 import importlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import usb.backend
 import usb.backend.libusb1
@@ -50,6 +50,15 @@ def translate(error: usb.core.USBError, what: str) -> DeviceError:
     code = error.errno if error.errno is not None else 0
     kind, remedy = _KINDS.get(code, (DeviceError, str(error.strerror or error)))
     return kind(f"{what}: {remedy} ({errno.errorcode.get(code, 'no error number')})")
+
+
+@contextmanager
+def translated(what: str) -> Iterator[None]:
+    """Raise pyusb's errors as a ``DeviceError``; see `translate`."""
+    try:
+        yield
+    except usb.core.USBError as error:
+        raise translate(error, what) from error
 
 
 def open_backend(spec: str) -> usb.backend.IBackend:
@@ -103,14 +112,11 @@ def find_device(
     Raises ``DeviceGoneError`` when none matches. Raises ``DeviceError`` when several match, or
     opening is refused.
     """
-    try:
+    others: list[str] = []
+    with translated(f"{name}: looking for it on the bus"):
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=matches))
         if serial:
             found, others = _with_serial(found, serial, name)
-        else:
-            others = []
-    except usb.core.USBError as error:
-        raise translate(error, f"{name}: looking for it on the bus") from error
     if not found:
         which = f" with serial {serial}" if serial else ""
         there = f"; there is {', '.join(others)}" if others else ""
@@ -118,7 +124,7 @@ def find_device(
             f"{name}: no such device{which} on the bus{there}; check cable, power and serial"
         )
     if len(found) > 1:
-        places = ", ".join(f"bus {d.bus} address {d.address}" for d in found)
+        places = ", ".join(map(_place, found))
         raise DeviceError(f"{name}: {len(found)} devices match ({places}); give the serial")
     device = found[0]
     try:
@@ -166,14 +172,12 @@ def claim(device: usb.core.Device, interface: int, name: str) -> bool:
     Raises ``DeviceError`` when another program holds it, or the kernel driver cannot be detached.
     """
     detached = False
-    try:
+    with translated(f"{name}: claiming interface {interface}"):
         with suppress(NotImplementedError):
             if device.is_kernel_driver_active(interface):
                 device.detach_kernel_driver(interface)
                 detached = True
         usb.util.claim_interface(device, interface)
-    except usb.core.USBError as error:
-        raise translate(error, f"{name}: claiming interface {interface}") from error
     return detached
 
 

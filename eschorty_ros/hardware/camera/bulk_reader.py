@@ -23,7 +23,7 @@ from eschorty_ros.core.base.errors import (
     DeviceStallError,
     DeviceTimeoutError,
 )
-from eschorty_ros.hardware.base.usb import translate
+from eschorty_ros.hardware.base.usb import translate, translated
 
 TRANSFERS = 20
 TRANSFER_BYTES = 128 << 10
@@ -80,10 +80,8 @@ class SyncReader:
 
     def resume(self) -> None:
         """Clear a halt."""
-        try:
+        with translated(_NAME):
             self._device.clear_halt(self._endpoint)
-        except usb.core.USBError as error:
-            raise translate(error, _NAME) from error
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Read one transfer."""

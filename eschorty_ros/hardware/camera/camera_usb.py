@@ -100,27 +100,21 @@ class CameraUsb:
 
     def send(self, frame: bytes) -> None:
         """Write a request."""
-        try:
+        request = int.from_bytes(frame[:4], "little")
+        with bus.translated(f"{NAME}: request {request:X}"):
             self.device.write(self.endpoints.control_out, frame, self._timeout_ms)
-        except usb.core.USBError as error:
-            request = int.from_bytes(frame[:4], "little")
-            raise bus.translate(error, f"{NAME}: request {request:X}") from error
 
     def receive(self) -> bytes:
         """Read an answer."""
-        try:
+        with bus.translated(f"{NAME}: waiting for an answer"):
             count = self.device.read(self.endpoints.control_in, self._answer, self._timeout_ms)
-        except usb.core.USBError as error:
-            raise bus.translate(error, f"{NAME}: waiting for an answer") from error
         return self._answer[:count].tobytes()
 
     def recover(self) -> None:
         """Clear halts of both control endpoints and discard waiting answers."""
         for endpoint in (self.endpoints.control_out, self.endpoints.control_in):
-            try:
+            with bus.translated(f"{NAME}: clearing endpoint {endpoint:#x}"):
                 self.device.clear_halt(endpoint)
-            except usb.core.USBError as error:
-                raise bus.translate(error, f"{NAME}: clearing endpoint {endpoint:#x}") from error
         drain(self.device, self.endpoints.control_in, self._answer)
 
     def shorten_timeouts(self) -> None:
@@ -143,10 +137,8 @@ def open_camera(backend: usb.backend.IBackend, serial: str) -> CameraUsb:
     if not serial:
         return CameraUsb(bus.find_device(backend, name=NAME, matches=_is_camera))
     others: list[str] = []
-    try:
+    with bus.translated(f"{NAME}: looking for it on the bus"):
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=_is_camera))
-    except usb.core.USBError as error:
-        raise bus.translate(error, f"{NAME}: looking for it on the bus") from error
     for place in [(device.bus, device.address) for device in found]:
         try:
             camera = CameraUsb(_find(backend, place))

@@ -15,7 +15,7 @@ import usb.core
 import usb.util
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceStallError
-from eschorty_ros.hardware.base.usb import claim, release, translate
+from eschorty_ros.hardware.base.usb import claim, release, translated
 
 INTERFACE_CLASS, INTERFACE_SUBCLASS = 0xFE, 0x03
 REPLY_LIMIT = 65_536
@@ -107,20 +107,16 @@ class UsbTmc:
 
     def reset(self) -> None:
         """Reset the USB port; raises ``DeviceError`` when that fails."""
-        try:
+        with translated(f"{self._name}: resetting the port"):
             self._device.reset()
-        except usb.core.USBError as error:
-            raise translate(error, f"{self._name}: resetting the port") from error
 
     def close(self) -> None:
         """Release the interface, give it back to the kernel driver it came from; never raises."""
         release(self._device, self._interface, reattach=self._detached)
 
     def _tmc_interface(self) -> Any:
-        try:
+        with translated(f"{self._name}: opening"):
             configuration = self._device.get_active_configuration()
-        except usb.core.USBError as error:
-            raise translate(error, f"{self._name}: opening") from error
         for interface in configuration:
             if _is_tmc(interface):
                 return interface
@@ -145,18 +141,14 @@ class UsbTmc:
         return message_id, self._tag, self._tag ^ 0xFF
 
     def _send(self, data: bytes, what: str) -> None:
-        try:
+        with translated(f"{self._name}: {what}"):
             sent = self._device.write(self._out.bEndpointAddress, data, self._timeout_ms)
-        except usb.core.USBError as error:
-            raise translate(error, f"{self._name}: {what}") from error
         if sent != len(data):
             raise DeviceError(f"{self._name}: {what}: {sent} of {len(data)} bytes went out")
 
     def _receive(self, size: int) -> bytes:
-        try:
+        with translated(f"{self._name}: reading a reply"):
             return bytes(self._device.read(self._in.bEndpointAddress, size, self._timeout_ms))
-        except usb.core.USBError as error:
-            raise translate(error, f"{self._name}: reading a reply") from error
 
     def _read_transfer(self) -> tuple[bytes, bool]:
         """Return the data of one reply transfer, and whether the message ends with it.
@@ -209,19 +201,15 @@ class UsbTmc:
         raise DeviceError(f"{self._name}: does not end clearing; switch it off and on")
 
     def _control(self, request: int, size: int) -> bytes:
-        try:
+        with translated(f"{self._name}: clearing"):
             answer = self._device.ctrl_transfer(
                 _CLASS_INTERFACE_IN, request, 0, self._interface, size, self._timeout_ms
             )
-        except usb.core.USBError as error:
-            raise translate(error, f"{self._name}: clearing") from error
         if len(answer) < size:
             raise DeviceError(f"{self._name}: clearing was answered with {len(answer)} bytes")
         return bytes(answer)
 
     def _clear_halts(self) -> None:
         for endpoint in (self._out, self._in):
-            try:
+            with translated(f"{self._name}: clearing a halt"):
                 self._device.clear_halt(endpoint.bEndpointAddress)
-            except usb.core.USBError as error:
-                raise translate(error, f"{self._name}: clearing a halt") from error
