@@ -32,7 +32,7 @@ class LaserInterlock:
     - ``max_on_s``: Longest time on.
     - ``timeouts_s``: Heartbeat topics that must be fresh, and the age in seconds at which each one
       is stale. A heartbeat that reports a stop is stale at once, as is one whose sender runs on
-      this host and dies or is stopped.
+      this host and ends or is stopped.
     - ``contact_timeout_s``: Age at which a source's report of the closed contact expires: it counts
       as open then.
     - ``contact_required``: Whether the contact counts as open before any source reports it closed.
@@ -111,15 +111,15 @@ class LaserInterlock:
             if is_open or source in self._closed_s or len(self._closed_s) < _KEPT:
                 self._closed_s[source] = None if is_open else self._now_s()
 
-    def reset_contact(self, living: Collection[str]) -> str:
+    def reset_contact(self, present: Collection[str]) -> str:
         """Undo the latch of an opened contact; return why that is refused, ``""`` when it is not.
 
         It is while a source reports it open, or its report of closed has expired. A source whose
-        name never became known, and that is not among the ``living`` any more, cannot report
+        name never became known, and that is not among the ``present`` any more, cannot report
         closed: it is dropped.
         """
         with self._contact_lock:
-            for source in self._nameless.difference(living):
+            for source in self._nameless.difference(present):
                 self._closed_s.pop(source, None)
                 self._nameless.discard(source)
             fault = self._source_fault()

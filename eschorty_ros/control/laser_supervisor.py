@@ -29,7 +29,7 @@ class LaserSupervisor:
     and disables the output when that is not what was requested. Commands wait for each other;
     disabling waits for none of them, nor for a callback, and voids those that would lead to light.
 
-    - ``running``: Whether the process means to go on; the output is disabled when it does not.
+    - ``running``: Whether the process continues; the output is disabled when it does not.
     - ``publish``: Called with the status after every change, in order.
     - ``alarm``: Called with one line when the device failed or its output is unknown.
     - ``log``: Called with one line when a watchdog disabled the output, and for warnings of the

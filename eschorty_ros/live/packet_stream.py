@@ -178,8 +178,8 @@ class PacketStream:
         self._retire()
         self._begin_epoch(SensorClock(zero_ns))
 
-    def forget_zero(self) -> None:
-        """Forget an announced zero before the next scan: its sender has ended."""
+    def drop_zero(self) -> None:
+        """Drop an announced zero before the next scan: its sender has ended."""
         self._zero_ended = True
 
     def restart_clock(self) -> bool:
@@ -294,7 +294,7 @@ class PacketStream:
                 self.packets_late += 1
                 continue
             if self._next_seq is not None and not self._goes_on(self._held[0]):
-                self._forget_stream()
+                self._end_stream()
             self._source = self._held[0].source
             if not self._ready(self._held[0], now_s):
                 break
@@ -327,7 +327,7 @@ class PacketStream:
         missing = packet.seq - self._next_seq
         return packet.source == self._source and 0 <= missing <= _LOST_MAX
 
-    def _forget_stream(self) -> None:
+    def _end_stream(self) -> None:
         self._retire()
         self.restarts += 1
         self._next_seq = None

@@ -68,7 +68,7 @@ class StagePlacer:
             self.track_restarts += 1
         self.track.append(t_us, position_mm)
         assert self.track.last_us is not None
-        self.track.forget_before(self.track.last_us - _HISTORY_US)
+        self.track.drop_before(self.track.last_us - _HISTORY_US)
 
     def add_profiles(self, timed: TimedProfiles, now_s: float) -> None:
         """Queue profiles that arrived at ``now_s`` of the steady clock."""

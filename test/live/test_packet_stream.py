@@ -208,7 +208,7 @@ def test_more_periods_than_a_frequency_allows_are_limited_with_a_warning():
 
 def test_a_zero_announced_again_is_not_forgotten_at_the_next_scan():
     subject = announced()
-    subject.forget_zero()
+    subject.drop_zero()
     subject.announce_zero(ZERO_NS)
     subject.begin_scan()
     assert subject.epoch is not None

@@ -136,7 +136,7 @@ class StageTrack:
         nm = self._nm[self._begin : self._end][kept]
         return self._t_us[self._begin : self._end][kept], nm / NM_PER_MM
 
-    def forget_before(self, t_us: int) -> None:
+    def drop_before(self, t_us: int) -> None:
         """Drop samples that no query at ``t_us`` or later needs."""
         integer("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
         held = self._t_us[self._begin : self._end]

@@ -78,7 +78,7 @@ def empty_bursts(columns: int) -> Bursts:
 
 
 @kernel(_nrt=True)
-def _forget_bursts(bursts):
+def _clear_bursts(bursts):
     bursts.events[:], bursts.rows_px[:] = 0.0, 0.0
     bursts.late[:], bursts.profiles[:] = _LATE, 0
 

@@ -250,7 +250,7 @@ def _cut_lines(variance, row, line_variance, sensor_rows, truncated, common2):
 
 @kernel(_nrt=False)
 def _replace(new, values):
-    """Replace values by new ones where there are any, and forget these."""
+    """Replace values by new ones where there are any, and clear these."""
     for c in range(np.uintp(values.size)):
         values[c] = values[c] if np.isnan(new[c]) else new[c]
         new[c] = np.nan

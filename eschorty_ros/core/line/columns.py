@@ -124,7 +124,7 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
 
 
 @kernel(_nrt=False)
-def _forget_refused(refused):
+def _clear_refused(refused):
     refused.over_limit = 0
     refused.outside_region = 0
     refused.gated = 0
@@ -207,7 +207,7 @@ def _append(events, first, limit_us, edge_us, columns, sensor_rows, gate):
     """Append the events before ``limit_us`` to `empty_columns`, or count why not."""
     t, x, y, p = events
     before = columns.counts.copy()
-    _forget_refused(columns.refused)
+    _clear_refused(columns.refused)
     size = np.uintp(columns.seeds.size)
     rows_end = np.uint32(sensor_rows)
     i = np.uintp(first)

@@ -86,8 +86,8 @@ def empty_scatter(columns: int, factor_max: float) -> Scatter:
 
 
 @kernel
-def _forget_scatter(scatter):
-    """Forget all differences."""
+def _clear_scatter(scatter):
+    """Clear all differences."""
     for sums in (scatter.own, scatter.near, scatter.far):
         sums.squares[:] = 0.0
         sums.expected[:] = 0.0

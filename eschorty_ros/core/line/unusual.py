@@ -148,7 +148,7 @@ def _update(widths, columns):
 
 @kernel
 def _restart_widths(widths, known):
-    """Forget all widths but the ``known`` ones, zeros where there are none."""
+    """Clear all widths but the ``known`` ones, zeros where there are none."""
     usual, history = widths.usual, widths.history
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan

@@ -161,7 +161,7 @@ class PhaseLock:
             at += size * self._stride
         self._seen += t_us.size
 
-    def _forget(self) -> None:
+    def _clear_block(self) -> None:
         self._seen, self._count, self._stride, self._observed = 0, 0, 1, False
 
     @property
@@ -188,7 +188,7 @@ class PhaseLock:
             estimate = estimate_phase(t_us, polarity, self._modulation)
             if estimate.found:
                 self._correct(estimate.edge_us)
-        self._forget()
+        self._clear_block()
         self._block_end_us = None if triggered else self.schedule.middle_after(self._block)
         return True
 

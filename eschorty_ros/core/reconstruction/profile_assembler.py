@@ -20,7 +20,7 @@ from eschorty_ros.core.line.columns import (
     _bin,
     _bin_all,
     _bins,
-    _forget_refused,
+    _clear_refused,
     _needs_room,
     wider_columns,
 )
@@ -387,7 +387,7 @@ def _pass(words, progress, decoder, span, edges, period, memory, before):
         takes_all = gate.step == 0 and columns.row_first.size == 0
         end_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
         _copy(columns.counts, decoder.numbers, *before)
-        _forget_refused(columns.refused)
+        _clear_refused(columns.refused)
         floor_us = max(state.edge_us, span.floor_us)
         part = _gate_part(max(state.part_us, floor_us), state.edge_us, gate)
         bins = _bins(columns, part, gate.keeps_late > 0, state.edge_us, floor_us)

@@ -111,7 +111,7 @@ class ProfileLength:
     def _of_blocks(self, held: HeldEvents, watermark_us: int, last: bool) -> int | None:
         """Return the periods of a profile by the blocks behind the window, 0 before their end.
 
-        Where these have no light, forget the window and return ``None``.
+        Where these have no light, drop the window and return ``None``.
         """
         assert self._window is not None
         t, period_us = held.arrays[0], self._modulation.period_us

@@ -12,8 +12,8 @@ from eschorty_ros.core.line.blinking import Blink, _add_lines
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.burst_shift import (
     Bursts,
+    _clear_bursts,
     _compare_bursts,
-    _forget_bursts,
     _points_followed,
     empty_bursts,
 )
@@ -60,7 +60,7 @@ from eschorty_ros.core.line.line_history import (
 from eschorty_ros.core.line.scatter import (
     FACTOR_MAX,
     Scatter,
-    _forget_scatter,
+    _clear_scatter,
     _scale,
     _scale_smoothed,
     empty_scatter,
@@ -241,8 +241,8 @@ def _begin_window(memory):
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:], memory.columns.events[:] = -1, 0
-    _forget_scatter(memory.scatter)
-    _forget_bursts(memory.bursts)
+    _clear_scatter(memory.scatter)
+    _clear_bursts(memory.bursts)
     memory.blink.lines[:] = 0.0
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
@@ -253,11 +253,11 @@ def _begin_window(memory):
 
 
 @kernel
-def _forget_usual(widths, bursts):
-    """Forget what is usual of the widths of lines, and of their bursts."""
+def _clear_usual(widths, bursts):
+    """Clear the usual widths of lines, and their bursts."""
     widths.usual.number[:], widths.below[:] = 0.0, 0.0
     widths.history.shift_px[:] = 0.0
-    _forget_bursts(bursts)
+    _clear_bursts(bursts)
 
 
 @kernel
@@ -332,7 +332,7 @@ def _gate_late(memory):
     columns, gate, counters = memory.columns, memory.gate, memory.counters
     if gate.choices.size > 0:
         if _learn_gate(columns, memory.state.half, memory.smoothing, gate):
-            _forget_usual(memory.smoothing.widths, memory.bursts)
+            _clear_usual(memory.smoothing.widths, memory.bursts)
             # The events of another gate have another delay and another footprint.
             memory.delay.time_us = memory.delay.points = 0
             _restart_from(memory.footprint, memory.known)
@@ -395,7 +395,7 @@ def _learn_line(memory, half, learns, late):
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            _forget_usual(smoothing.widths, memory.bursts)
+            _clear_usual(smoothing.widths, memory.bursts)
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)

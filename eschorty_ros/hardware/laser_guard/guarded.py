@@ -46,7 +46,7 @@ _LATE_S = 0.1
 class GuardedLaser:
     """Laser modulator served by a guard process (see ``guard``); thread-safe.
 
-    ``disable`` overtakes every other call. Should the guard itself die or be stopped, this process
+    ``disable`` overtakes every other call. Should the guard itself end or be stopped, this process
     opens the generator to disable it; every call but ``disable`` and ``close`` then fails.
 
     - ``make``: ``module:callable`` that opens the generator, in the guard.

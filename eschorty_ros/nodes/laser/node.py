@@ -75,7 +75,7 @@ class LaserNode(DeviceNode):
     ever published it reports closed within ``interlock_timeout`` and ``laser/reset_interlock`` is
     called. ``interlock_required``: open, too, while no node has. The output is disabled when
     ``laser/heartbeat`` (of the client that had it enabled), ``camera/heartbeat`` or
-    ``stage/heartbeat`` is stale or its sender on this host dies, with an open interlock, after
+    ``stage/heartbeat`` is stale or its sender on this host ends, with an open interlock, after
     ``max_on_time``, and when the generator does not read back as requested. Watchdog threads on the
     steady clock check this, also when the executor is stuck.
     Spin it with several threads: commands take their time, heartbeats must not wait for them.
@@ -191,7 +191,7 @@ class LaserNode(DeviceNode):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        refusal = self._supervisor.interlock.reset_contact(self._contacts.living())
+        refusal = self._supervisor.interlock.reset_contact(self._contacts.present())
         response.success = not refusal
         response.message = f"laser refused: {refusal}" if refusal else "interlock closed"
         self._supervisor.report()

@@ -154,7 +154,7 @@ class ReconstructionNode(Node):
         stream = self._pipeline.stream
         self._announcement = LatchedState(
             self, TimeReference, "camera/clock", self._on_clock,
-            lambda: self._post(stream.forget_zero), short,
+            lambda: self._post(stream.drop_zero), short,
         )  # fmt: skip
         LatchedState(
             self, PositionTrigger, "stage/trigger", self._on_trigger,
@@ -273,11 +273,11 @@ class ReconstructionNode(Node):
         """
         topics = ["camera/events", "stage/odom", *([] if self._override else ["laser/state"])]
         faults = {topic: publishers_fault(self, topic) for topic in topics}
-        silence = self._stage.silence_fault(self, "stage/odom")
+        pause = self._stage.pause_fault(self, "stage/odom")
         names = map(self.resolve_topic_name, topics)
         several = any(self.count_publishers(name) > 1 for name in names)
-        message = "; ".join(fault for fault in (*faults.values(), silence) if fault)
-        return message, several or bool(faults["stage/odom"] or silence)
+        message = "; ".join(fault for fault in (*faults.values(), pause) if fault)
+        return message, several or bool(faults["stage/odom"] or pause)
 
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")

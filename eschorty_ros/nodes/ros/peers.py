@@ -19,7 +19,7 @@ from eschorty_ros.nodes.ros.steady_timer import steady_timer
 _PUBLISHER_TIMEOUT_NS = 250_000_000
 _CHECK_S = 1.0
 # A stage at rest sends 5 times per second.
-_SILENT_S = 1.5
+_PAUSE_S = 1.5
 _NAMES_MAX = 64
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
@@ -47,15 +47,15 @@ class OnePublisher:
         self._received_s = time.monotonic()
         return publisher
 
-    def silence_fault(self, node: Node, topic: str) -> str:
+    def pause_fault(self, node: Node, topic: str) -> str:
         """Return that the publisher is there and sends nothing, ``""`` when it sends or has left.
 
         One that ended without leaving stays for 10 to 20 s, in which its successor may be unknown.
         """
-        full, silent_s = node.resolve_topic_name(topic), time.monotonic() - self._received_s
-        if silent_s < _SILENT_S or self._publisher not in _living(node, full):
+        full, paused_s = node.resolve_topic_name(topic), time.monotonic() - self._received_s
+        if paused_s < _PAUSE_S or self._publisher not in _present(node, full):
             return ""
-        return f"nothing on {full} for {silent_s:.0f} s; look at its node, publish at rest, too"
+        return f"nothing on {full} for {paused_s:.0f} s; look at its node, publish at rest, too"
 
 
 class Publishers:
@@ -73,9 +73,9 @@ class Publishers:
         """Return the identity of a message's publisher as text."""
         return _publisher(info).hex()
 
-    def living(self) -> set[str]:
+    def present(self) -> set[str]:
         """Return the identities of those that are there."""
-        return {publisher.hex() for publisher in _living(self._node, self._topic)}
+        return {publisher.hex() for publisher in _present(self._node, self._topic)}
 
     def name(self, info: Mapping[str, Any]) -> str:
         """Return the full name of the node that published a message, ``""`` while it is unknown."""
@@ -97,7 +97,7 @@ class LatchedState:
     The states of the publishers that are left are then received again.
 
     - ``take``: Receives each message.
-    - ``forget``: Called when the publisher of the newest message has ended.
+    - ``ended``: Called when the publisher of the newest message has ended.
     """
 
     def __init__(
@@ -106,23 +106,23 @@ class LatchedState:
         kind: Any,
         topic: str,
         take: Callable[[Any], None],
-        forget: Callable[[], None],
+        ended: Callable[[], None],
         group: CallbackGroup | None = None,
     ) -> None:
         self._node, self._kind, self._topic, self._group = node, kind, topic, group
-        self._take, self._forget = take, forget
+        self._take, self._ended = take, ended
         self._publisher: bytes = b""
         self.subscription = self._subscribed()
         steady_timer(node, _CHECK_S, self.check, group)
 
     def check(self) -> None:
-        """Forget the state if its publisher has ended."""
+        """End the state if its publisher has ended."""
         if not self._publisher:
             return
-        if self._publisher in _living(self._node, self.subscription.topic_name):
+        if self._publisher in _present(self._node, self.subscription.topic_name):
             return
         self._publisher = b""
-        self._forget()
+        self._ended()
         ended, self.subscription = self.subscription, self._subscribed()
         self._node.destroy_subscription(ended)
 
@@ -156,7 +156,7 @@ def publishers_fault(node: Node, topic: str) -> str:
     return f"{found}; stop all but one, a killed one is listed for 20 s"
 
 
-def _living(node: Node, topic: str) -> set[bytes]:
+def _present(node: Node, topic: str) -> set[bytes]:
     """Return the identities of a topic's publishers."""
     return {bytes(end.endpoint_gid) for end in node.get_publishers_info_by_topic(topic)}
 

@@ -144,7 +144,7 @@ class Timeline(Generic[Setting]):
         k = bisect_right(self._times, t_us)
         return self._times[k] if k < len(self._times) else None
 
-    def forget_before(self, t_us: int) -> None:
+    def drop_before(self, t_us: int) -> None:
         """Drop settings that no time from ``t_us`` on needs."""
         k = max(bisect_right(self._times, t_us) - 1, 0)
         del self._times[:k], self._settings[:k]
@@ -155,7 +155,7 @@ class LaserTimeline:
 
     def __init__(self) -> None:
         self._gates: Timeline[Gate | None] = Timeline()
-        self.forget_before = self._gates.forget_before
+        self.drop_before = self._gates.drop_before
 
     def set(
         self, t_us: int, on: bool, modulation: Modulation | None, clock_rate: Fraction = Fraction(1)
@@ -219,7 +219,7 @@ class StageTimeline:
 
     def __init__(self) -> None:
         self._plans: Timeline[tuple[MotionPlan, int, Fraction]] = Timeline()
-        self.forget_before = self._plans.forget_before
+        self.drop_before = self._plans.drop_before
 
     def set(
         self, t_us: int, plan: MotionPlan, zero_ns: int, clock_rate: Fraction = Fraction(1)

@@ -200,9 +200,9 @@ class World:
             if step_us > (self._encoder.time_us or 0):
                 parts.append(self._encoder.advance(step_us))
             self._now_us = end_us
-            self._laser.forget_before(self._handled_us)
-            self._stage.forget_before(self._handled_us)
-            self._controls.forget_before(self._now_us)
+            self._laser.drop_before(self._handled_us)
+            self._stage.drop_before(self._handled_us)
+            self._controls.drop_before(self._now_us)
         return b"".join(parts)
 
     @property

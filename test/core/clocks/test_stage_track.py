@@ -31,19 +31,19 @@ def test_samples_that_go_back_are_dropped_and_counted():
     np.testing.assert_array_equal(stage.position_mm([100, 150, 250]), [1.0, 1.5, 2.5])
 
 
-def test_forgetting_keeps_what_later_queries_need():
+def test_dropping_keeps_what_later_queries_need():
     stage = StageTrack()
     for t_us in range(0, 20_000, 10):
         stage.append(t_us, t_us * 1e-3)
         if t_us >= 500:
-            stage.forget_before(t_us - 495)
+            stage.drop_before(t_us - 495)
             assert len(stage) <= 52
             assert stage.position_mm([t_us - 495])[0] == pytest.approx((t_us - 495) * 1e-3)
     assert (stage.first_us, stage.last_us) == (19_490, 19_990)
-    stage.forget_before(10**9)
+    stage.drop_before(10**9)
     assert (len(stage), stage.first_us) == (1, 19_990)
     empty = StageTrack()
-    empty.forget_before(5)
+    empty.drop_before(5)
     assert (empty.first_us, empty.last_us) == (None, None)
 
 

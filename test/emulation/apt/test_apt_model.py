@@ -158,7 +158,7 @@ def test_garbage_from_the_host_is_skipped() -> None:
     assert status.position == 0
 
 
-def test_a_restart_forgets_everything() -> None:
+def test_a_restart_resets_everything() -> None:
     host = Host()
     host.ask(*ENABLE_AND_HOME, seconds=2.0)
     (status,) = host.ask(STATUS)

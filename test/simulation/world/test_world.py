@@ -304,7 +304,7 @@ def test_other_waveforms_are_reconstructed_too(waveform: str, duty: float, tmp_p
     assert abs(np.median(error)) < 0.3
 
 
-def test_timelines_replace_the_future_and_forget_the_past() -> None:
+def test_timelines_replace_the_future_and_drop_the_past() -> None:
     laser, stage = LaserTimeline(), StageTimeline()
     laser.set(100, True, Modulation(100.0, 0.5, "square", 0))
     laser.set(900, False, None)
@@ -314,8 +314,8 @@ def test_timelines_replace_the_future_and_forget_the_past() -> None:
     stage.set(0, MotionPlan(0, 3.0), 0)
     stage.set(1000, MotionPlan(1_000_000, 5.0), 0)
     assert [stage.state(t)[0] for t in (-1, 0, 999, 1000)] == [0.0, 3.0, 3.0, 5.0]
-    laser.forget_before(600)
-    stage.forget_before(2000)
+    laser.drop_before(600)
+    stage.drop_before(2000)
     assert not laser.level(600)
     assert stage.state(2000)[0] == 5.0
 
