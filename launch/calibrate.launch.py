@@ -1,4 +1,4 @@
-"""Camera, laser, stage and reconstruction, each a process of its own, and one calibration.
+"""Calibrate once: camera, laser, stage and reconstruction, each a process of its own.
 
 ros2 launch eschorty_ros calibrate.launch.py method:=paper capture_time:=2
 ros2 launch eschorty_ros calibrate.launch.py --show-args
@@ -9,5 +9,5 @@ from eschorty_ros.nodes.ros.launching import description
 
 
 def generate_launch_description():
-    """Bench and nodes."""
+    """Return the description of bench and nodes."""
     return description(CALIBRATE, calibrate)

@@ -1,4 +1,4 @@
-"""A recording through the reconstruction node, without any device.
+"""Replay a recording to the reconstruction node, without any device.
 
 ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 """
@@ -8,5 +8,5 @@ from eschorty_ros.nodes.ros.launching import description
 
 
 def generate_launch_description():
-    """Replay and reconstruction; RViz on request."""
+    """Return the description of replay, reconstruction and, on request, RViz."""
     return description(REPLAY, replay)

@@ -1,4 +1,4 @@
-"""Camera, laser, stage, reconstruction and scanner, each a process of its own, and one scan.
+"""Scan once: camera, laser, stage, reconstruction and scanner, each a process of its own.
 
 ros2 launch eschorty_ros scan.launch.py scene:=sphere speed:=0.02 rviz:=true
 ros2 launch eschorty_ros scan.launch.py --show-args
@@ -9,5 +9,5 @@ from eschorty_ros.nodes.ros.launching import description
 
 
 def generate_launch_description():
-    """Bench, nodes; RViz on request, and closing it ends everything."""
+    """Return the description of bench, nodes and, on request, RViz, which ends all when closed."""
     return description(SCAN, scan)

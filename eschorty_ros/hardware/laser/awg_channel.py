@@ -9,7 +9,7 @@ from typing import TypeVar
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity
-from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Burst, Value
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.scpi import Scpi
@@ -56,16 +56,22 @@ def requested_settings(
             f"duty is {modulation.duty:g}; waveform {modulation.waveform} has none but 0.5"
         )
     if counted and profile.burst is not None:
-        requested |= {
-            "mode": profile.burst.mode,
-            "burst_type": profile.burst.type,
-            "burst_source": profile.burst.source,
-            "burst_cycles": float(max(1, int(settings.light_grant * modulation.frequency_hz))),
-            "burst_phase": 180.0 * (1.0 + modulation.duty),
-        }
+        cycles = max(1, int(settings.light_grant * modulation.frequency_hz))
+        requested |= _burst_settings(profile.burst, cycles, 180.0 * (1.0 + modulation.duty))
     for name, value in requested.items():
         profile.settings[name].check(name, value)
     return requested
+
+
+def _burst_settings(burst: Burst, cycles: int, phase_deg: float) -> Requested:
+    """Return the settings of a burst, in the order in which they are made."""
+    return {
+        "mode": burst.mode,
+        "burst_type": burst.type,
+        "burst_source": burst.source,
+        "burst_cycles": float(cycles),
+        "burst_phase": phase_deg,
+    }
 
 
 class AwgChannel:
@@ -213,14 +219,7 @@ class AwgChannel:
         burst, own = self._profile.burst, self._settings.channel
         if burst is None or not self.reads_back:
             return False
-        tried: Requested = {
-            "mode": burst.mode,
-            "burst_type": burst.type,
-            "burst_source": burst.source,
-            "burst_cycles": 2.0,
-            "burst_phase": 270.0,
-        }
-        for name, value in tried.items():
+        for name, value in _burst_settings(burst, 2, 270.0).items():
             try:
                 self._set(name, value)
                 # At the first difference: a query that the generator does not know has no reply.
