@@ -40,7 +40,7 @@ def command(path: Path) -> None:
       eschorty info scan/scan.pcd
     """  # noqa: D301
     from eschorty_ros.core.optics import load_calibration
-    from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
+    from eschorty_ros.core.reconstruction.stage_faults import stage_faults
     from eschorty_ros.core.storage import (
         LASER_FILE,
         TRUTH_FILE,

@@ -1,6 +1,7 @@
 """From the camera's bytes to profiles and points."""
 
 from eschorty_ros.core.reconstruction.live_cloud import LIVE_DTYPE, LIVE_SPAN_NS, live_points
+from eschorty_ros.core.reconstruction.missing_points import without_modulation
 from eschorty_ros.core.reconstruction.offline import (
     Result,
     reconstruct_recording,
@@ -16,7 +17,6 @@ from eschorty_ros.core.reconstruction.profiles import (
     stage_offset_m,
 )
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
-from eschorty_ros.core.reconstruction.recording_warnings import without_modulation
 from eschorty_ros.core.reconstruction.region import SensorWindow, region_window
 from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
 from eschorty_ros.core.reconstruction.warm_up import warm_up

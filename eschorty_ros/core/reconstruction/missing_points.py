@@ -9,9 +9,25 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED
 from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, periods_max
 from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction.stream_faults import is_unreadable
+from eschorty_ros.core.storage import Points
 
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
+_FEW = 10
+_LOSSES = {
+    "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
+    "it, or raise periods_per_profile = {0.periods_per_profile}",
+    "columns_isolated": "columns have no neighbour within isolation_gate_px = "
+    "{0.isolation_gate_px:g}; raise it, or lower isolation_events = {0.isolation_events}",
+    "columns_ambiguous": "columns have two equally strong lines; set returns to all",
+    "points_beyond_pole": "points are beyond the last range of the calibration; check it",
+    "points_outside_roi": "points are outside range_min and range_max; widen them",
+    "points_outside_scan": "points are outside start to stop of the recorded scan; check the "
+    "stage's positions",
+}
+"""Losses after which no point is left, with what to do; ``{0}`` are the settings."""
+_FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to none"
 
 
 def missing_points(
@@ -122,3 +138,39 @@ def _long_profiles(settings: Settings, modulation: Modulation, periods_per_profi
         f"{periods_per_profile} periods make a profile, "
         f"{modulation.frequency_hz / periods_per_profile:.4g} profiles per second"
     )
+
+
+def without_modulation(events: int, frequency_hz: float) -> str:
+    """Return the cause of few points where the laser's modulation is not in the events."""
+    if not events:
+        return "no events came; look at the camera, its lens cap and the laser"
+    return (
+        f"hardly any of {events:,} events follow the laser's modulation at {frequency_hz:g} Hz; "
+        "look at its frequency, at the focus and at what the line falls on"
+    )
+
+
+def few_points(
+    settings: Settings, counters: Mapping[str, int], points: Points, dark: str, modulated: bool
+) -> list[str]:
+    """Return the largest loss where it left few points or none, ``dark`` where there is none."""
+    outside = 2 * max(counters["events_gated"], counters["events_outside_roi"])
+    if outside > counters["events"] or is_unreadable(counters):
+        # The reconstructor has a line for it.
+        return []
+    lost = max(_LOSSES, key=lambda name: counters[name])
+    if modulated and not len(points) and counters["columns_unmodulated"] > counters[lost]:
+        # It has one for this, too.
+        return []
+    if 2 * counters["events_filtered"] > counters["events"]:
+        words, count = _FILTERED, counters["events_filtered"]
+    else:
+        words, count = _LOSSES[lost], counters[lost]
+        unused = counters["events_binned"] - float(points["intensity"].sum())
+        # Background alone leaves columns with few events, too.
+        if len(points) and unused < Settings().events_min * count:
+            return []
+    if len(points) and count <= _FEW * len(points):
+        return []
+    cause = f"{count:,} {words.format(settings)}" if modulated and count else dark
+    return [f"{len(points):,} points: {cause}"]

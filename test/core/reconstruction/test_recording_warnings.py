@@ -12,8 +12,8 @@ from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
-from eschorty_ros.core.reconstruction.recording_warnings import stage_faults
 from eschorty_ros.core.reconstruction.settings import KEEP
+from eschorty_ros.core.reconstruction.stage_faults import stage_faults
 from eschorty_ros.core.storage import ScanLog, load_recording
 from eschorty_ros.core.storage.raw_file import RawWriter
 from eschorty_ros.simulation.pixels import preset
