@@ -215,7 +215,7 @@ def _usual_late(columns, gate):
 
 
 @kernel(_nrt=True)
-def _learn_gate(columns, half, smoothing, gate):
+def _learn_gate(columns, half, smoothing, history, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
     A gate is chosen again when the line moves twice as fast, in profiles one after the other, or
@@ -223,7 +223,7 @@ def _learn_gate(columns, half, smoothing, gate):
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0
-    moving = np.int64(_displacement_px(smoothing.widths.history) * FRACTION)
+    moving = np.int64(_displacement_px(history) * FRACTION)
     if state.known > 0:
         uses_gate = state.on_span != gate.choices[0].on_span
         faster = uses_gate and moving > max(2 * state.moving, _STILL)

@@ -128,6 +128,16 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     )
 
 
+@kernel
+def _restart_history(history):
+    """Clear the means of recent profiles, and what follows from them."""
+    for values in history.recent:
+        values[:] = 0.0
+    for values in history.polarities:
+        values[:] = 0.0
+    history.step_px[:], history.passing2[:], history.shift_px[:] = 0.0, 0.0, 0.0
+
+
 @kernel(_nrt=False)
 def _polarity_rows(packed, start, seed, half):
     """Return how far the row of a column's events is from the middle of those of ON and OFF ones.

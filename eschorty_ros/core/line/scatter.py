@@ -222,7 +222,7 @@ def _smoothed_ratio(scatter, block):
 
 
 @kernel(_nrt=False)
-def _scale(rows, scatter, smoothing):
+def _scale(rows, scatter, smoothing, polarities):
     """Scale the variances of a profile by the scatter, and widen the smoothing gates by it.
 
     With a ``factor_max`` of 0, for means over full columns, they are as expected.
@@ -235,7 +235,7 @@ def _scale(rows, scatter, smoothing):
         measured = ratio >= 0.0 and scatter.factor_max > 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
-        apart2 = _polarity_variance(smoothing.widths.history.polarities, block)
+        apart2 = _polarity_variance(polarities, block)
         locking2 = 0.0
         if measured:
             locking2 = _pixel_locking_variance(scatter.ends, sums.number, block, levels, apart2)

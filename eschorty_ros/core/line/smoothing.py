@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
-from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
@@ -20,6 +19,10 @@ _ISOLATION_REACH = 2
 _NEAR = 2
 # Share of a profile's errors that the next keeps.
 _KEPT = 0.5
+# Neighbours on either side that a width is averaged with.
+WIDTH_PAIRS = 2
+# Columns of such a mean.
+WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 
 
 class Averages(NamedTuple):
@@ -56,7 +59,7 @@ class Smoothing(NamedTuple):
     sigma2: NDArray[np.float64]
     used: NDArray[np.float64]
     gates_px: NDArray[np.float64]
-    widths: Widths
+    width: NDArray[np.float64]
 
 
 def half_widths(largest: int) -> NDArray[np.int64]:
@@ -70,11 +73,10 @@ def empty_smoothing(
     gate_px: float,
     isolation_gate_px: float,
     isolation_events: int,
-    widths: Widths,
+    shape: tuple[int, int],
 ) -> Smoothing:
-    """Return the smoothing of profiles with ``widths``, by half widths up to the ``largest``."""
-    shape, tried = widths.smoothed.shape, half_widths(largest)
-    columns = shape[1]
+    """Return the smoothing of profiles of a ``shape``, by half widths up to the ``largest``."""
+    tried, columns = half_widths(largest), shape[1]
     blocks = -(-columns // BLOCK_COLUMNS)
     differences, averaged = np.zeros((2, tried.size, *shape))
     sigma2_before, variance_before = np.zeros((2, columns + 1))
@@ -91,7 +93,7 @@ def empty_smoothing(
         sigma2=sigma2,
         used=used,
         gates_px=gates_px,
-        widths=widths,
+        width=np.full(shape, np.nan),
     )
 
 
@@ -228,7 +230,7 @@ def _divide(rows, smoothing):
     smoothed = 0
     for k in range(rows.row.shape[0]):
         own, row, used = rows.row[k], smoothing.row[k], smoothing.used[k]
-        sigma2, width = smoothing.sigma2[k], smoothing.widths.smoothed[k]
+        sigma2, width = smoothing.sigma2[k], smoothing.width[k]
         for c in range(np.uintp(own.size)):
             row[c] = own[c] + row[c] / used[c]
         for c in range(np.uintp(own.size)):
@@ -251,7 +253,7 @@ def _smooth(rows, smoothing):
     n is their sum over n squared. The variance ``common2``, which neighbours share, is not reduced
     and not included yet.
     """
-    widths, averages, errors = smoothing.widths, smoothing.averages, smoothing.errors
+    averages, errors = smoothing.averages, smoothing.errors
     difference, used = averages.difference, averages.used
     returns, columns = rows.row.shape
     added = 0
@@ -275,7 +277,7 @@ def _smooth(rows, smoothing):
             for c in range(first, end):
                 n = used[level, k, c]
                 sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages)
-                smoothing.sigma2[k, c], widths.smoothed[k, c] = sums
+                smoothing.sigma2[k, c], smoothing.width[k, c] = sums
                 smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
     return _divide(rows, smoothing)
 

@@ -26,13 +26,12 @@ from eschorty_ros.core.line.line_history import (
     PER_WIDTH,
     STEADY,
     STEADY_PROFILES,
-    LineHistory,
     _compare_with_recent,
     _same_for,
-    empty_history,
 )
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART
+from eschorty_ros.core.line.smoothing import WIDTH_COLUMNS, WIDTH_PAIRS
 
 # Widths that are separated, per row and in all.
 _PER_ROW = 16
@@ -50,10 +49,6 @@ _POINTS_MIN = 512.0
 _PROFILES_KEPT = 256
 # The widths that a window begins with count as so many profiles.
 _PROFILES_KNOWN = 16
-# Neighbours on either side that a width is averaged with.
-WIDTH_PAIRS = 2
-# Columns of such a mean.
-WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 # Steps of the running median of differences are this share of it, larger ones at first.
 _STEP = 1.0 / 1024.0
 # Standard deviation over the median size of differences.
@@ -75,15 +70,14 @@ class UsualWidths(NamedTuple):
 class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
-    ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``static_width`` less what motion adds, ``last`` and ``last_row`` widths and rows of the last
-    one. The ``same_width`` has been the same for ``same`` profiles; ``steady``, with
-    ``steady_row``, is the last that was for some. The ``history`` has what changes.
+    ``below`` has the sums of the points by width. ``static_width`` holds the widths of a profile
+    less what motion adds, ``last`` and ``last_row`` widths and rows of the last one. The
+    ``same_width`` has been the same for ``same`` profiles; ``steady``, with ``steady_row``, is the
+    last that was for some.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
-    smoothed: NDArray[np.float64]
     static_width: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
@@ -91,16 +85,13 @@ class Widths(NamedTuple):
     same: NDArray[np.float64]
     steady: NDArray[np.float64]
     steady_row: NDArray[np.float64]
-    history: LineHistory
 
 
-def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
-    """Return no widths."""
-    shape = returns, columns
+def empty_widths(shape: tuple[int, int]) -> Widths:
+    """Return no widths of profiles of a ``shape``."""
     return Widths(
         usual=empty_usual_widths(),
         below=np.zeros(_BINS + 1),
-        smoothed=np.full(shape, np.nan),
         static_width=np.full(shape, np.nan),
         last=np.full(shape, np.nan),
         last_row=np.full(shape, np.nan),
@@ -108,7 +99,6 @@ def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -
         same=np.zeros(shape),
         steady=np.full(shape, np.nan),
         steady_row=np.full(shape, np.nan),
-        history=empty_history(columns, common_px, windowed),
     )
 
 
@@ -125,7 +115,7 @@ def _width_bin(width):
 @kernel(_nrt=True)
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles."""
-    points, usual = _PROFILES_KNOWN * widths.smoothed.shape[1], widths.usual
+    points, usual = _PROFILES_KNOWN * widths.last.shape[1], widths.usual
     known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
     known.median.difference = usual.median.difference
 
@@ -149,17 +139,12 @@ def _update(widths, columns):
 @kernel
 def _restart_widths(widths, known):
     """Clear all widths but the ``known`` ones, zeros where there are none."""
-    usual, history = widths.usual, widths.history
-    usual.number[:], usual.median.difference = known.number, known.median.difference
+    widths.usual.number[:] = known.number
+    widths.usual.median.difference = known.median.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
-    for values in history.recent:
-        values[:] = 0.0
-    for values in history.polarities:
-        values[:] = 0.0
     widths.below[:] = 0.0
-    history.step_px[:], history.passing2[:], history.shift_px[:] = 0.0, 0.0, 0.0
-    _update(widths, widths.smoothed.shape[1])
+    _update(widths, widths.last.shape[1])
 
 
 @kernel(_nrt=False)
@@ -193,7 +178,7 @@ def _mixed_variance(rows, smoothing, k, c, sigma_width):
     It is between the rows two columns to either side, and that of a choice between these two. Its
     line is wider by that, where a slope leaves the width as it is: half decides.
     """
-    row, smoothed = smoothing.row, smoothing.widths.smoothed
+    row, smoothed = smoothing.row, smoothing.width
     pairs = np.intp(WIDTH_PAIRS)
     left, right = c - pairs, c + pairs
     if left < 0 or right >= row.shape[1]:
@@ -240,19 +225,19 @@ def _without_motion(smoothed, row, last_row, usual, lit_share, static_width):
 
 
 @kernel(_nrt=False)
-def _follow_line(rows, smoothing, lit_share):
+def _follow_line(rows, smoothing, widths, history, lit_share):
     """Take motion off the widths of a profile's points, and compare it with recent profiles.
 
     Weak points show no width.
     """
-    row, widths = smoothing.row, smoothing.widths
-    now, static_width, median = widths.history.now, widths.static_width, widths.usual.median
+    row, static_width, median = smoothing.row, widths.static_width, widths.usual.median
+    now = history.now
     returns, columns = row.shape
     known = _is_known(widths)
     usual = median.width if known else np.inf
     for k in range(returns):
         _without_motion(
-            widths.smoothed[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
+            smoothing.width[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
         )
     for block in range(1, now.points.size - 1):
         total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
@@ -268,7 +253,7 @@ def _follow_line(rows, smoothing, lit_share):
         now.row[block], now.width[block] = total, width
         now.sigma2[block], now.points[block] = sigma2, points
     sigma = _SIGMA_PER_MEDIAN * median.difference
-    _compare_with_recent(widths.history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
+    _compare_with_recent(history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel
@@ -312,12 +297,12 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
 
 
 @kernel
-def _passing_variance(widths, k, c, sigma_width):
+def _passing_variance(widths, passing2, k, c, sigma_width):
     """Return the variance of a row near an edge that passes its block of columns, px squared.
 
-    It is beside a line that has, within its scatter, the usual and its steady width.
+    ``passing2`` is that of the block. The row's line has, within its scatter, the usual and its
+    steady width.
     """
-    passing2 = widths.history.passing2[c // BLOCK_COLUMNS + 1]
     if passing2 == 0.0:
         return 0.0
     width, steady = widths.static_width[k, c], widths.steady[k, c]
@@ -328,12 +313,12 @@ def _passing_variance(widths, k, c, sigma_width):
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, few, lit_share):
+def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
-    row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
-    _follow_line(rows, smoothing, lit_share)
+    row, sigma2, smoothed = smoothing.row, smoothing.sigma2, smoothing.width
+    _follow_line(rows, smoothing, widths, history, lit_share)
     returns, columns = row.shape
-    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
+    last, last_row = widths.last, widths.last_row
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
@@ -344,7 +329,8 @@ def _mark_unusual(rows, smoothing, few, lit_share):
         for c in range(columns):
             width, displacement = widths.static_width[k, c], row[k, c] - last_row[k, c]
             row2, limit2 = sigma2[k, c], _MARKED**2 * rows.sigma2[k, c]
-            sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
+            block = c // BLOCK_COLUMNS + 1
+            sigma2[k, c] += history.moved2[block]
             rows.mixed[k, c] = False
             events = rows.events[k, c]
             weak = few <= events < smoothing.isolation_events
@@ -372,7 +358,8 @@ def _mark_unusual(rows, smoothing, few, lit_share):
             if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
-            sigma2[k, c] += max(edge2, _passing_variance(widths, k, c, sigma))
+            passing2 = _passing_variance(widths, history.passing2[block], k, c, sigma)
+            sigma2[k, c] += max(edge2, passing2)
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 pairs += 1.0
                 median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)

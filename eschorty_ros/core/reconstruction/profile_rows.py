@@ -54,8 +54,11 @@ from eschorty_ros.core.line.learned_gate import (
 )
 from eschorty_ros.core.line.line_history import (
     RECENT_PROFILES,
+    LineHistory,
     _compare_polarities,
     _mean_step_px,
+    _restart_history,
+    empty_history,
 )
 from eschorty_ros.core.line.scatter import (
     FACTOR_MAX,
@@ -69,6 +72,7 @@ from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth, empty_smoothing
 from eschorty_ros.core.line.unusual import (
     UsualWidths,
+    Widths,
     _is_known,
     _keep_widths,
     _mark_unusual,
@@ -167,6 +171,8 @@ class Memory(NamedTuple):
     known_widths: UsualWidths
     scatter: Scatter
     smoothing: Smoothing
+    widths: Widths
+    history: LineHistory
     light: Light
     delay: Any
     rows: Rows
@@ -213,8 +219,10 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
             settings.smoothing_gate_px,
             settings.isolation_gate_px,
             settings.isolation_events,
-            empty_widths(*shape, settings.sigma_common_px, windowed),
+            shape,
         ),
+        widths=empty_widths(shape),
+        history=empty_history(model.columns, settings.sigma_common_px, windowed),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
         delay=record("time_us", "points"),
@@ -247,17 +255,18 @@ def _begin_window(memory):
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
     _restart_gate(memory.gate)
-    _restart_widths(memory.smoothing.widths, memory.known_widths)
+    _restart_widths(memory.widths, memory.known_widths)
+    _restart_history(memory.history)
     if memory.footprint.state.near_edge == 0:
         _restart_from(memory.footprint, memory.known)
 
 
 @kernel
-def _clear_usual(widths, bursts):
+def _clear_usual(memory):
     """Clear the usual widths of lines, and their bursts."""
-    widths.usual.number[:], widths.below[:] = 0.0, 0.0
-    widths.history.shift_px[:] = 0.0
-    _clear_bursts(bursts)
+    memory.widths.usual.number[:], memory.widths.below[:] = 0.0, 0.0
+    memory.history.shift_px[:] = 0.0
+    _clear_bursts(memory.bursts)
 
 
 @kernel
@@ -331,8 +340,8 @@ def _gate_late(memory):
     """Leave out the late events that are not the line's, where the phase of the light is gated."""
     columns, gate, counters = memory.columns, memory.gate, memory.counters
     if gate.choices.size > 0:
-        if _learn_gate(columns, memory.state.half, memory.smoothing, gate):
-            _clear_usual(memory.smoothing.widths, memory.bursts)
+        if _learn_gate(columns, memory.state.half, memory.smoothing, memory.history, gate):
+            _clear_usual(memory)
             # The events of another gate have another delay and another footprint.
             memory.delay.time_us = memory.delay.points = 0
             _restart_from(memory.footprint, memory.known)
@@ -359,14 +368,13 @@ def _follow(memory, half, restarted):
     ``restarted`` says that the laser or the period's edge has started again.
     """
     state, columns, blink = memory.state, memory.columns, memory.blink
-    widths, place = memory.smoothing.widths, state.profiles % BLOCK_COLUMNS
-    history = widths.history
+    history, place = memory.history, state.profiles % BLOCK_COLUMNS
     if restarted:
         blink.lines[:] = 0.0
     _add_lines(columns, half, place, blink)
     _compare_polarities(columns, half, place, history)
     # Before a width is usual, an edge that passes is not seen.
-    if history.windowed and _is_known(widths):
+    if history.windowed and _is_known(memory.widths):
         common2 = memory.rows.common2[0]
         _compare_bursts(columns, half, state.profiles, blink, common2, memory.bursts, history)
     state.profiles += 1
@@ -380,25 +388,25 @@ def _learn_line(memory, half, learns, late):
     of events.
     """
     state, counters, footprint = memory.state, memory.counters, memory.footprint
-    estimator, smoothing, rows = memory.estimator, memory.smoothing, memory.rows
+    estimator, rows, history = memory.estimator, memory.rows, memory.history
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
-    if _choose(footprint, rows.row[0], smoothing.widths.history, late and enough, always):
+    if _choose(footprint, rows.row[0], history, late and enough, always):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
         computations, lopsided = footprint.state.computations, footprint.state.lopsided
-        lit_way_px = memory.light.lit_share * _mean_step_px(smoothing.widths.history)
-        _learn(footprint, rows, smoothing.row[0], estimator.sensor_rows, lit_way_px)
+        lit_way_px = memory.light.lit_share * _mean_step_px(history)
+        _learn(footprint, rows, memory.smoothing.row[0], estimator.sensor_rows, lit_way_px)
         counters.footprints += footprint.state.computations - computations
         counters.footprints_lopsided += footprint.state.lopsided - lopsided
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            _clear_usual(smoothing.widths, memory.bursts)
+            _clear_usual(memory)
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
-            _keep_widths(smoothing.widths, memory.known_widths)
+            _keep_widths(memory.widths, memory.known_widths)
             _keep_gate(memory.gate)
 
 
@@ -417,13 +425,13 @@ def _close(memory):
     counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
     _count(sums, counters)
     counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter, smoothing)
+    _scale(rows, scatter, smoothing, memory.history.polarities)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     few = _few_events(rows, smoothing.isolation_events, state)
-    _mark_unusual(rows, smoothing, few, memory.light.lit_share)
-    followed = _points_followed(smoothing.widths.history)
+    _mark_unusual(rows, smoothing, memory.widths, memory.history, few, memory.light.lit_share)
+    followed = _points_followed(memory.history)
     counters.points_followed += followed.points
     counters.points_burst_shift += followed.shifted
     counters.points_one_polarity += followed.of_one_polarity
