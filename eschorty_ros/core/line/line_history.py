@@ -235,59 +235,85 @@ def _move_alike(now, recent):
 
 
 @kernel(_nrt=False)
-def _compare_with_recent(history, known, usual, width_variance):
-    """Compare the sums of a profile with recent profiles, and add them.
+def _motion_variance(history, block, row, own2, weight):
+    """Return the variance of the rows of a line that moves, px squared.
 
-    A line that has its ``usual`` width again for some profiles, where it is ``known``, has passed
-    the edge.
+    ``own2`` is the variance of the block's mean ``row``, and ``weight`` that of the profile among
+    the recent ones, whose mean follows the line by as much as it moves from one to the next.
     """
-    now, recent, polarities = history.now, history.recent, history.polarities
+    polarities = history.polarities
+    moved = row - history.recent.row[block]
+    moved2 = moved * moved - own2
+    apart = weight * abs(moved) if moved2 > 0.0 else 0.0
+    history.step_px[block] = apart
+    if not _has_one_polarity(polarities, block):
+        compared = 0
+        for other in range(block - 1, block + 2):
+            compared += polarities.columns[other] > 0.0
+        apart = min(apart, abs(_near_sum(polarities.row, block)) / max(compared, 1))
+    off2, shift_px = history.common_px**2 + apart * apart, history.shift_px[block]
+    return min(max(moved2, 0.0), off2) + shift_px * shift_px
+
+
+@kernel(_nrt=False)
+def _jitter_variance(recent, block, row, own2, weight, alike):
+    """Return the variance of rows that jump forth and back, px squared; see `_motion_variance`.
+
+    Jumps of more than a row count where blocks move ``alike``.
+    """
+    difference, before = row - recent.last[block], recent.difference[block]
+    near = max(abs(difference), abs(before)) < _JITTER_MAX_PX
+    if (near or alike) and recent.profiles[block] > 1.0:
+        # The smaller of the two: one large jump alone is another surface.
+        back = -np.sign(difference * before) * min(abs(difference), abs(before)) ** 2
+        recent.jitter2[block] += weight * (_JITTER_PER_BACK * back - recent.jitter2[block])
+    recent.difference[block] = difference
+    return max(recent.jitter2[block] - own2, 0.0)
+
+
+@kernel(_nrt=False)
+def _edge_variance(recent, block, width, width2, known, usual):
+    """Return the variance of rows near an edge that passes, px squared; 0 while none is ``known``.
+
+    A line that has its ``usual`` width again for some profiles has passed the edge. ``width2`` is
+    the variance of the block's mean ``width``.
+    """
+    least, most = min(recent.width[block], usual), max(recent.width[block], usual)
+    since_steady = _changed_since_steady(recent, block, width, width2)
+    changed = max(least - width, width - most, since_steady) if known else 0.0
+    return max(PER_WIDTH**2 * (changed * changed - width2), 0.0)
+
+
+@kernel(_nrt=False)
+def _compare_with_recent(history, known, usual, width_variance):
+    """Compare the mean rows and widths of a profile with those of recent profiles, and add them.
+
+    The ``usual`` width is ``known`` after some profiles.
+    """
+    now, recent = history.now, history.recent
     alike = _move_alike(now, recent)
     for block in range(1, now.points.size - 1):
-        points, profiles = _near_sum(now.points, block), recent.profiles[block]
+        points = _near_sum(now.points, block)
         history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
         history.step_px[block] = 0.0
         if points == 0.0 or not history.windowed:
             continue
         row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points
-        moved = row - recent.row[block]
-        own2 = _near_sum(now.sigma2, block) / (points * points)
-        moved2 = moved * moved - own2
-        least, most = min(recent.width[block], usual), max(recent.width[block], usual)
-        width2 = width_variance / points
-        since_steady = _changed_since_steady(recent, block, width, width2)
-        changed = max(least - width, width - most, since_steady) if known else 0.0
-        passing2 = PER_WIDTH**2 * (changed * changed - width2)
-        profiles = min(profiles + 1.0, RECENT_PROFILES)
-        # The first profiles, of pixels just lit, are soon forgotten.
+        own2, width2 = _near_sum(now.sigma2, block) / (points * points), width_variance / points
+        history.passing2[block] = _edge_variance(recent, block, width, width2, known, usual)
+        profiles = min(recent.profiles[block] + 1.0, RECENT_PROFILES)
+        # The first profiles, of pixels just lit, soon count little.
         weight = 2.0 / (profiles + 1.0)
+        limit = np.inf
         if profiles > 1.0:
-            # The mean of recent rows follows the line by as much as it moves from one to the next.
-            history.step_px[block] = weight * abs(moved) if moved2 > 0.0 else 0.0
-            apart = history.step_px[block]
-            if not _has_one_polarity(polarities, block):
-                compared = 0
-                for other in range(block - 1, block + 2):
-                    compared += polarities.columns[other] > 0.0
-                apart = min(apart, abs(_near_sum(polarities.row, block)) / max(compared, 1))
-            off2 = history.common_px**2 + apart * apart
-            shift_px = history.shift_px[block]
-            history.moved2[block] = min(max(moved2, 0.0), off2) + shift_px * shift_px
-            difference, before = row - recent.last[block], recent.difference[block]
-            near = max(abs(difference), abs(before)) < _JITTER_MAX_PX
-            if (near or alike) and profiles > 2.0:
-                # The smaller of the two: one large jump alone is another surface.
-                back = -np.sign(difference * before) * min(abs(difference), abs(before)) ** 2
-                recent.jitter2[block] += weight * (_JITTER_PER_BACK * back - recent.jitter2[block])
-            recent.difference[block] = difference
-            history.moved2[block] += max(recent.jitter2[block] - own2, 0.0)
-        recent.last[block] = row
-        history.passing2[block] = max(passing2, 0.0)
+            moved2 = _motion_variance(history, block, row, own2, weight)
+            jitter2 = _jitter_variance(recent, block, row, own2, weight, alike)
+            history.moved2[block] = moved2 + jitter2
+            # What an edge that passes changes at once is no scatter, and counts little.
+            limit = RECENT_PROFILES / profiles * np.sqrt(width2) if known else limit
+        recent.last[block], recent.profiles[block] = row, profiles
         recent.row[block] += weight * (row - recent.row[block])
-        # What an edge that passes changes at once is no scatter, and counts little.
-        limit = RECENT_PROFILES / profiles * np.sqrt(width2) if known and profiles > 1.0 else np.inf
         recent.width[block] += weight * max(min(width - recent.width[block], limit), -limit)
-        recent.profiles[block] = profiles
 
 
 @kernel(_nrt=False)
