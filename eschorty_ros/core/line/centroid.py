@@ -334,7 +334,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0
-            columns.rivals[c], columns.events[c] = -1, 0
+            columns.second_rows[c], columns.events[c] = -1, 0
             continue
         column = _column(packed, columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0
@@ -345,7 +345,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         if windowed and estimator.seeded and columns.seeds[c] >= 0:
             window = _mean_shift(column, columns.seeds[c], half, 0, ROW_LAST)
             if _is_clear(window, column, estimator, blink):
-                columns.rivals[c] = -1
+                columns.second_rows[c] = -1
                 columns.seeds[c] = neighbour = window.centre
                 columns.events[c] = window.sums.events
                 _put((0, c), window, n, False, out)

@@ -28,9 +28,9 @@ from eschorty_ros.core.line.window import (
 
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 16
-# Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
-# column's own.
-_VOTE = 0.45
+# Weight of each of two neighbours' excess of events; 2 x 0.45 < 1, so that it sums to at most 10
+# times a column's own.
+_NEAR_WEIGHT = 0.45
 # Share of its events that a line keeps where nothing hides it.
 _UNCHANGED = 0.85
 
@@ -104,27 +104,27 @@ def _all_returns(column, half, estimator, found):
 
 
 @kernel(_nrt=False)
-def _vote(columns, c, a, b, half):
-    """Return by how many events neighbours have window ``a`` stronger than its rival ``b``.
+def _excess_nearby(columns, c, a, b, half):
+    """Return by how many events neighbours have window ``a`` stronger than ``b``.
 
     They are the same column in the last period and the column before, where the windows continue
     their two lines.
     """
-    evidence = 0.0
+    excess = 0.0
     for other in (c, c - 1):
-        if other < 0 or columns.rivals[other] < 0:
+        if other < 0 or columns.second_rows[other] < 0:
             continue
-        first, second = columns.seeds[other], columns.rivals[other]
+        first, second = columns.seeds[other], columns.second_rows[other]
         if max(abs(a.centre - first), abs(b.centre - second)) <= half:
-            evidence += _VOTE * columns.evidence[other]
+            excess += _NEAR_WEIGHT * columns.excess[other]
         elif max(abs(a.centre - second), abs(b.centre - first)) <= half:
-            evidence -= _VOTE * columns.evidence[other]
-    return evidence
+            excess -= _NEAR_WEIGHT * columns.excess[other]
+    return excess
 
 
 @kernel(_nrt=False)
 def _stronger(column, c, half, columns, estimator, blink, found):
-    """Return the stronger one of a column's two returns; in a stream its neighbours vote.
+    """Return the stronger one of a column's two returns; in a stream its neighbours count, too.
 
     Boxes of dense events are full in the middle of every line; complete windows separate them.
     """
@@ -135,19 +135,19 @@ def _stronger(column, c, half, columns, estimator, blink, found):
         # A second window is a second chance for background.
         alone = not _laser_test(column, b.first, b.last, blink).sure
     if alone:
-        columns.rivals[c] = -1
+        columns.second_rows[c] = -1
         return Returns(FOUND, False, a, a)
-    evidence = float(a.sums.events - b.sums.events)
+    excess = float(a.sums.events - b.sums.events)
     if estimator.seeded:
-        evidence += _vote(columns, c, a, b, half)
-    columns.rivals[c] = -1
+        excess += _excess_nearby(columns, c, a, b, half)
+    columns.second_rows[c] = -1
     # Of two complete windows with as many events the one with the denser middle is the line.
-    if evidence == 0.0 and found.status == AMBIGUOUS:
+    if excess == 0.0 and found.status == AMBIGUOUS:
         return Returns(AMBIGUOUS, True, a, b)
-    if evidence < 0.0:
+    if excess < 0.0:
         a, b = b, a
-    columns.rivals[c] = b.centre
-    columns.evidence[c] = abs(evidence)
+    columns.second_rows[c] = b.centre
+    columns.excess[c] = abs(excess)
     return Returns(FOUND, False, a, a)
 
 
@@ -191,16 +191,16 @@ def _goes_on(window, found, columns, c, half, estimator):
     """Return whether a column's line is where it was, as strong, and another one is new there.
 
     A lamp or an edge that passes can have a burst in phase with the laser, but not in two profiles
-    at the same rows. What is new and stays is a rival in the next profile.
+    at the same rows. What is new and stays is the second line of the next profile.
     """
-    new, old, rival = found.window, window.sums.events, columns.rivals[c]
+    new, old, second_row = found.window, window.sums.events, columns.second_rows[c]
     return (
         found.status == FOUND
         and estimator.returns == _STRONGEST
         and old >= max(_UNCHANGED * columns.events[c], float(estimator.events_min))
         and columns.events[c] > 0
         and abs(new.centre - window.centre) > half
-        and (rival < 0 or abs(new.centre - rival) > half)
+        and (second_row < 0 or abs(new.centre - second_row) > half)
     )
 
 
@@ -215,9 +215,9 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
         goes_on = testing and _goes_on(window, found, columns, c, half, estimator)
         if goes_on and _laser_test(column, window.first, window.last, blink).sure:
             new = found.window
-            columns.rivals[c], columns.evidence[c] = new.centre, 0.0
+            columns.second_rows[c], columns.excess[c] = new.centre, 0.0
             if not _laser_test(column, new.first, new.last, blink).follows:
-                columns.rivals[c] = -1
+                columns.second_rows[c] = -1
                 column = _without(column, new.first, new.last)
             return _ColumnReturns(Returns(FOUND, False, window, window), column, False)
     in_phase = found.status == FOUND and _is_of_the_stream(column, found.window, blink)
@@ -226,7 +226,7 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
         found, column = modulated.found, modulated.column
         uncertain = modulated.uncertain
         if found.status == UNMODULATED:
-            columns.rivals[c] = -1
+            columns.second_rows[c] = -1
             return modulated
     if estimator.returns != _STRONGEST:
         found = _all_returns(column, half, estimator, found)
@@ -241,5 +241,5 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
         ):
             found = _stronger(column, c, half, columns, estimator, blink, found)
         else:
-            columns.rivals[c] = -1
+            columns.second_rows[c] = -1
     return _ColumnReturns(found, column, uncertain)

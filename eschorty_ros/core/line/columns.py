@@ -25,8 +25,8 @@ class Columns(NamedTuple):
     of ``starts[columns + c]``: appended to the others they find room there.
 
     - ``seeds``: Row of the line in the last period, fixed point; -1 for none.
-    - ``rivals``: Row of a second line that is nearly as strong; -1 for none.
-    - ``evidence``: Events that the first line has had more than the second; 0 for none.
+    - ``second_rows``: Row of a second line that is nearly as strong; -1 for none.
+    - ``excess``: Events that the first line has had more than the second; 0 for none.
     - ``events``: Events of the first line.
     - ``room``, ``limit``: Room for the events of a column, and what it may grow to.
     - ``row_first``, ``row_span``: In a region of interest the first row that a column takes, and
@@ -38,8 +38,8 @@ class Columns(NamedTuple):
     starts: NDArray[np.int64]
     counts: NDArray[np.uint32]
     seeds: NDArray[np.int64]
-    rivals: NDArray[np.int64]
-    evidence: NDArray[np.float64]
+    second_rows: NDArray[np.int64]
+    excess: NDArray[np.float64]
     events: NDArray[np.int64]
     room: int
     limit: int
@@ -89,8 +89,8 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
         starts=np.arange(2 * columns).reshape(columns, 2).T.ravel() * size,
         counts=np.zeros(2 * columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
-        rivals=np.full(columns, -1, np.int64),
-        evidence=np.zeros(columns),
+        second_rows=np.full(columns, -1, np.int64),
+        excess=np.zeros(columns),
         events=np.zeros(columns, np.int64),
         room=room,
         limit=limit,

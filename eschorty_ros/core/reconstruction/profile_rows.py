@@ -248,7 +248,7 @@ def _begin_window(memory):
     state.window = state.profiles = state.recent_points = state.recent_events = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
-    memory.columns.rivals[:], memory.columns.events[:] = -1, 0
+    memory.columns.second_rows[:], memory.columns.events[:] = -1, 0
     _clear_scatter(memory.scatter)
     _clear_bursts(memory.bursts)
     memory.blink.lines[:] = 0.0
