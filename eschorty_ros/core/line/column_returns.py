@@ -33,6 +33,8 @@ _WINDOWS_MAX = 16
 _NEAR_WEIGHT = 0.45
 # Share of its events that a line keeps where nothing hides it.
 _UNCHANGED = 0.85
+# Profiles at the same rows after which a second line may be the stronger one.
+_SECOND_SEEN = 3
 
 
 class _ColumnReturns(NamedTuple):
@@ -103,6 +105,43 @@ def _all_returns(column, half, estimator, found):
     return _second_return(column, half, estimator.rows_taken, estimator.events_min, found.window)
 
 
+@kernel
+def _is_second(columns, c, window, half):
+    """Return whether a window is where the column had its second line in the last profile."""
+    return columns.second_rows[c] >= 0 and abs(window.centre - columns.second_rows[c]) <= half
+
+
+@kernel
+def _is_at(found, window, half):
+    """Return whether a window is where the ``window`` around the column's last row is."""
+    return abs(found.centre - window.centre) <= half
+
+
+@kernel
+def _stays(window, columns, c, estimator):
+    """Return whether the ``window`` around a column's last row has most of that line's events."""
+    least = max(_UNCHANGED * columns.events[c], float(estimator.events_min))
+    return columns.events[c] > 0 and window.sums.events >= least
+
+
+@kernel
+def _is_new(columns, c, window, half):
+    """Return whether a window has not been the second line of a column in the last profiles.
+
+    A lamp, a screen or an edge that passes can have a burst in phase with the laser, but not in
+    many profiles at the same rows.
+    """
+    return not _is_second(columns, c, window, half) or columns.second_seen[c] < _SECOND_SEEN
+
+
+@kernel
+def _set_second(columns, c, window, excess, half):
+    """Set a column's second line, which has so many events less than the first one."""
+    again = _is_second(columns, c, window, half)
+    columns.second_seen[c] = columns.second_seen[c] + 1 if again else 1
+    columns.second_rows[c], columns.excess[c] = window.centre, excess
+
+
 @kernel(_nrt=False)
 def _excess_nearby(columns, c, a, b, half):
     """Return by how many events neighbours have window ``a`` stronger than ``b``.
@@ -123,9 +162,10 @@ def _excess_nearby(columns, c, a, b, half):
 
 
 @kernel(_nrt=False)
-def _stronger(column, c, half, columns, estimator, blink, found):
+def _stronger(column, c, half, columns, estimator, blink, window, found):
     """Return the stronger one of a column's two returns; in a stream its neighbours count, too.
 
+    A line that stays in the ``window`` around its last row is not left for one that is new.
     Boxes of dense events are full in the middle of every line; complete windows separate them.
     """
     both = _all_returns(column, half, estimator, found)
@@ -140,14 +180,17 @@ def _stronger(column, c, half, columns, estimator, blink, found):
     excess = float(a.sums.events - b.sums.events)
     if estimator.seeded:
         excess += _excess_nearby(columns, c, a, b, half)
-    columns.second_rows[c] = -1
-    # Of two complete windows with as many events the one with the denser middle is the line.
-    if excess == 0.0 and found.status == AMBIGUOUS:
-        return Returns(AMBIGUOUS, True, a, b)
     if excess < 0.0:
-        a, b = b, a
-    columns.second_rows[c] = b.centre
-    columns.excess[c] = abs(excess)
+        a, b, excess = b, a, -excess
+    stays = _stays(window, columns, c, estimator)
+    if stays and _is_at(b, window, half) and _is_new(columns, c, a, half):
+        a, b, excess = b, a, 0.0
+    stays = stays and _is_at(a, window, half) and _is_new(columns, c, b, half)
+    # Of two complete windows with as many events the one with the denser middle is the line.
+    if excess == 0.0 and found.status == AMBIGUOUS and not stays:
+        columns.second_rows[c] = -1
+        return Returns(AMBIGUOUS, True, a, b)
+    _set_second(columns, c, b, excess, half)
     return Returns(FOUND, False, a, a)
 
 
@@ -188,19 +231,15 @@ def _is_clear(window, column, estimator, blink):
 
 @kernel(_nrt=False)
 def _goes_on(window, found, columns, c, half, estimator):
-    """Return whether a column's line is where it was, as strong, and another one is new there.
-
-    A lamp or an edge that passes can have a burst in phase with the laser, but not in two profiles
-    at the same rows. What is new and stays is the second line of the next profile.
-    """
-    new, old, second_row = found.window, window.sums.events, columns.second_rows[c]
+    """Return whether a column's line is where it was, as strong, and another one is new there."""
+    elsewhere = found.status == FOUND or not _is_at(found.other, window, half)
     return (
-        found.status == FOUND
+        found.status != TOO_FEW
         and estimator.returns == _STRONGEST
-        and old >= max(_UNCHANGED * columns.events[c], float(estimator.events_min))
-        and columns.events[c] > 0
-        and abs(new.centre - window.centre) > half
-        and (second_row < 0 or abs(new.centre - second_row) > half)
+        and elsewhere
+        and not _is_at(found.window, window, half)
+        and _stays(window, columns, c, estimator)
+        and _is_new(columns, c, found.window, half)
     )
 
 
@@ -215,8 +254,9 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
         goes_on = testing and _goes_on(window, found, columns, c, half, estimator)
         if goes_on and _laser_test(column, window.first, window.last, blink).sure:
             new = found.window
-            columns.second_rows[c], columns.excess[c] = new.centre, 0.0
-            if not _laser_test(column, new.first, new.last, blink).follows:
+            if _laser_test(column, new.first, new.last, blink).follows:
+                _set_second(columns, c, new, 0.0, half)
+            else:
                 columns.second_rows[c] = -1
                 column = _without(column, new.first, new.last)
             return _ColumnReturns(Returns(FOUND, False, window, window), column, False)
@@ -239,7 +279,7 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
         if found.status == AMBIGUOUS or (
             found.status == FOUND and not _is_alone(used, column.events)
         ):
-            found = _stronger(column, c, half, columns, estimator, blink, found)
+            found = _stronger(column, c, half, columns, estimator, blink, window, found)
         else:
             columns.second_rows[c] = -1
     return _ColumnReturns(found, column, uncertain)

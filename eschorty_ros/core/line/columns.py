@@ -26,6 +26,7 @@ class Columns(NamedTuple):
 
     - ``seeds``: Row of the line in the last period, fixed point; -1 for none.
     - ``second_rows``: Row of a second line that is nearly as strong; -1 for none.
+    - ``second_seen``: Profiles in which that line has been at its rows.
     - ``excess``: Events that the first line has had more than the second; 0 for none.
     - ``events``: Events of the first line.
     - ``room``, ``limit``: Room for the events of a column, and what it may grow to.
@@ -39,6 +40,7 @@ class Columns(NamedTuple):
     counts: NDArray[np.uint32]
     seeds: NDArray[np.int64]
     second_rows: NDArray[np.int64]
+    second_seen: NDArray[np.int64]
     excess: NDArray[np.float64]
     events: NDArray[np.int64]
     room: int
@@ -90,6 +92,7 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
         counts=np.zeros(2 * columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
         second_rows=np.full(columns, -1, np.int64),
+        second_seen=np.zeros(columns, np.int64),
         excess=np.zeros(columns),
         events=np.zeros(columns, np.int64),
         room=room,

@@ -117,16 +117,20 @@ def test_columns_with_light_of_two_surfaces_are_flagged_where_a_stream_has_many(
     assert np.mean(error < 2.0 * found.sigma_row) > 0.95
 
 
-def test_a_glint_is_flagged():
+@pytest.mark.parametrize("hides", [False, True])
+def test_a_glint_is_flagged_where_it_hides_the_line_and_else_not_taken_for_it(hides):
     """It is broader than the line, and so may be a line that moves; columns beside it do not."""
     camera, bright = Camera(periods=30), Camera(periods=30, half_width_px=15.0, seed=6)
 
-    def glint(k, c):
-        return np.where((k in (20, 21, 22)) & (c >= 600) & (c < 620), wavy(k, c) - 150.0, np.nan)
+    def shines(k, c):
+        return (k in (20, 21, 22)) & (c >= 600) & (c < 620)
 
-    found, _ = points(camera, camera.line(wavy), bright.line(glint))
+    line = camera.line(lambda k, c: np.where(hides & shines(k, c), np.nan, wavy(k, c)))
+    glint = bright.line(lambda k, c: np.where(shines(k, c), wavy(k, c) - 150.0, np.nan))
+    found, _ = points(camera, line, glint)
     off = np.abs(error_px(found)) > 10.0
-    assert off.sum() > 30, f"seeds {camera.seed} and {bright.seed}"
+    assert (off.sum() > 30) == hides, f"seeds {camera.seed} and {bright.seed}"
+    assert hides or not off.any()
     assert np.all(found.flags[off] > 0)
     assert np.mean(found.flags[~off] > 0) < 0.01
 
@@ -526,6 +530,18 @@ def test_a_lamp_beside_the_line_is_not_taken_for_it(lamp_hz, half_width_px):
     later = found.select(found.period >= 8)
     assert len(later) > 0.99 * 52 * 1280, f"seed {camera.seed}"
     # In the first profiles of a window nothing shows where the line was.
+    assert np.mean(np.abs(error_px(later)) > 10.0) < 0.02
+
+
+def test_a_screen_in_phase_with_the_laser_now_and_then_is_not_taken_for_the_line():
+    """It is refreshed at 60 Hz, and in phase with a laser of 70 Hz in every seventh profile."""
+    camera = Camera(periods=22)
+    flicker = {"half_width_px": 75.0, "threshold": 0.5, "events_max": 4, "delay_us": 600.0}
+    screen = Camera(frequency_hz=60.0, periods=18, seed=7, **flicker)
+    beside = screen.line(lambda _, c: np.where(np.abs(c - 640) < 20, 520.0, np.nan))
+    found, _ = points(camera, camera.line(wavy), beside)
+    later = found.select((found.period >= 8) & (np.abs(found.column - 640.0) < 20))
+    assert len(later) > 0.95 * 14 * 39, f"seeds {camera.seed} and {screen.seed}"
     assert np.mean(np.abs(error_px(later)) > 10.0) < 0.02
 
 
