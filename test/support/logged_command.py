@@ -15,11 +15,10 @@ ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 300.0
 _LOGGED = """
 import functools, sys
-from eschorty_ros.nodes.one_process import calibration, scan
+from eschorty_ros.nodes.one_process import calibration, composition
 log, capture_s = sys.argv.pop(1), float(sys.argv.pop(1))
-made = scan.bench_options
-for module in (calibration, scan):
-    module.bench_options = lambda *values: made(*values) | {"laser-log": log}
+process = composition.bench_process
+composition.bench_process = lambda folder, options: process(folder, {**options, "laser-log": log})
 calibration.CalibrationJob = functools.partial(calibration.CalibrationJob, capture_s=capture_s)
 from eschorty_ros.cli import main
 main(prog_name="eschorty")

@@ -14,7 +14,6 @@ from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.nodes.one_process.composition import (
-    bench_options,
     bench_parameters,
     composition,
 )
@@ -59,7 +58,7 @@ def calibrate_once(job: CalibrationJob, feedback: Progress) -> CalibrationResult
     """
     tables = bench_parameters()
     tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}
-    bench = bench_options("posts", job.as_built, 0, "paper")
+    bench = {"scene": "posts", "calibration": job.as_built, "seed": 0}
     with composition(tables, (Calibrate, "calibrate"), bench) as running:
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],

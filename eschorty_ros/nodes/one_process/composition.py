@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.base.files import temporary_folder
 from eschorty_ros.core.base.progress import Progress
-from eschorty_ros.emulation.bench.process import bench_process
+from eschorty_ros.emulation.bench.process import START_S, bench_process
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
@@ -41,8 +41,6 @@ NODES = {
     "scanner": ScannerNode,
 }
 THREADS = 12
-START_S = 300.0
-"""A slow machine's first start compiles for minutes."""
 _POLL_S = 0.02
 
 FEEDBACK_TIMEOUT_S = 300.0
@@ -64,20 +62,6 @@ def bench_parameters() -> Tables:
     tables["camera"]["trigger_in_mode"] = "external"
     tables["reconstruction"]["trigger_source"] = "stage"
     return tables
-
-
-def bench_options(
-    scene: str, calibration: str, seed: int, pixels: str, effects: str = "none"
-) -> dict[str, object]:
-    """Return options of a bench whose stage triggers the camera."""
-    return {
-        "scene": scene,
-        "calibration": calibration,
-        "seed": seed,
-        "pixels": pixels,
-        "effects": effects,
-        "trigger": "stage",
-    }
 
 
 class Composition:

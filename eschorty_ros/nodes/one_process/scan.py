@@ -14,10 +14,9 @@ from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import ScanRequest, check_request
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, finite_points
+from eschorty_ros.emulation.bench.process import START_S
 from eschorty_ros.nodes.one_process.composition import (
-    START_S,
     Tables,
-    bench_options,
     bench_parameters,
     composition,
     wait,
@@ -101,7 +100,8 @@ def scan_once(job: ScanJob, feedback: Progress) -> ScanResult:
         tables["reconstruction"]["organized"] = "on"
     bench = None
     if job.hardware is None:
-        bench = bench_options(job.scene, job.calibration, job.seed, job.pixels, job.effects)
+        names = ("scene", "calibration", "seed", "pixels", "effects")
+        bench = {name: getattr(job, name) for name in names}
     goal = Scan.Goal(
         start=job.start_mm * 1e-3,
         stop=job.stop_mm * 1e-3,

@@ -9,7 +9,7 @@ import pytest
 from eschorty_ros.action import Scan
 from PIL import Image
 
-from eschorty_ros.nodes.one_process.composition import bench_options, bench_parameters, composition
+from eschorty_ros.nodes.one_process.composition import bench_parameters, composition
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
@@ -55,7 +55,7 @@ def test_a_scan_is_started_from_the_page_and_its_points_appear(page, tmp_path):
     tables = bench_parameters()
     tables["reconstruction"].update(calibration="config_3")
     tables["viewer"] = {"port": free_port(), "allow_scan": True}
-    bench = bench_options("steps", "config_3", 1, "paper")
+    bench = {"scene": "steps", "calibration": "config_3", "seed": 1}
     with composition(tables, (Scan, "scan"), bench) as running:
         running.wait_until_active(lambda share, note: None)
         viewer = next(node for node in running.nodes if node.get_name() == "viewer")
