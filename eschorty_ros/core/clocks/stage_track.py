@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.array_queue import ArrayQueue
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, times
 from eschorty_ros.core.base.errors import ArgumentError
 
@@ -49,24 +50,22 @@ class StageTrack:
             integer("max_gap_us", max_gap_us, 1, TIME_LIMIT)
         self.max_gap_us = max_gap_us
         self.dropped = 0
-        self._t_us = np.empty(256, np.int64)
-        self._nm = np.empty(256, np.int64)
-        self._begin = 0
-        self._end = 0
+        # Times in us and positions in nm.
+        self._samples = ArrayQueue((np.int64, np.int64), 256)
 
     def __len__(self) -> int:
         """Return the count of samples kept."""
-        return self._end - self._begin
+        return len(self._samples)
 
     @property
     def first_us(self) -> int | None:
         """Time of the oldest sample kept, ``None`` when there is none."""
-        return int(self._t_us[self._begin]) if len(self) else None
+        return int(self._samples.arrays[0][0]) if len(self) else None
 
     @property
     def last_us(self) -> int | None:
         """Time of the newest sample, ``None`` when there is none."""
-        return int(self._t_us[self._end - 1]) if len(self) else None
+        return int(self._samples.arrays[0][-1]) if len(self) else None
 
     def append(self, t_us: ArrayLike, position_mm: ArrayLike) -> None:
         """Add samples; those not later than all before them are dropped and counted.
@@ -94,7 +93,7 @@ class StageTrack:
         newest_before = np.maximum.accumulate(np.concatenate(([floor], at_us)))[:-1]
         later = at_us > newest_before
         self.dropped += int(later.size - np.count_nonzero(later))
-        self._extend(at_us[later], positions[later])
+        self._samples.append((at_us[later], positions[later]))
 
     def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
         """Return the stage position at times of the samples' clock.
@@ -110,7 +109,7 @@ class StageTrack:
             mm; NaN outside the samples and inside a gap longer than ``max_gap_us``.
         """
         query = times("t_us", t_us)
-        held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
+        held, nm = self._samples.arrays
         if held.size == 0 or query.size == 0:
             return np.full(query.shape, np.nan)
         low, high = query.min(), query.max()
@@ -132,28 +131,12 @@ class StageTrack:
 
     def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return times and positions (mm) of the samples kept, those before ``t_us`` left out."""
-        kept = self._t_us[self._begin : self._end] >= t_us
-        nm = self._nm[self._begin : self._end][kept]
-        return self._t_us[self._begin : self._end][kept], nm / NM_PER_MM
+        at_us, nm = self._samples.arrays
+        kept = at_us >= t_us
+        return at_us[kept], nm[kept] / NM_PER_MM
 
     def drop_before(self, t_us: int) -> None:
         """Drop samples that no query at ``t_us`` or later needs."""
         integer("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
-        held = self._t_us[self._begin : self._end]
-        self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)
-
-    def _extend(self, times: NDArray[np.int64], nm: NDArray[np.int64]) -> None:
-        if self._end + times.size > self._t_us.size:
-            self._make_room(times.size)
-        stop = self._end + times.size
-        self._t_us[self._end : stop] = times
-        self._nm[self._end : stop] = nm
-        self._end = stop
-
-    def _make_room(self, count: int) -> None:
-        size = max(2 * (len(self) + count), 256)
-        for name in ("_t_us", "_nm"):
-            grown = np.empty(size, np.int64)
-            grown[: len(self)] = getattr(self, name)[self._begin : self._end]
-            setattr(self, name, grown)
-        self._begin, self._end = 0, len(self)
+        at_us, _ = self._samples.arrays
+        self._samples.drop(max(int(np.searchsorted(at_us, t_us, side="right")) - 1, 0))
