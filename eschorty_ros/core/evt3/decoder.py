@@ -22,6 +22,7 @@ from eschorty_ros.core.evt3.state_machine import (
     _STATE,
     DecoderMemory,
     _bounds,
+    _broken,
     _decode_events,
     _trigger_arrays,
 )
@@ -145,15 +146,22 @@ class Decoder:
     def go_on_from(self, other: Decoder) -> None:
         """Take over the state of ``other``, without its counts."""
         self._numbers[: len(_STATE)] = other._numbers[: len(_STATE)]
+        self._state["held_broken"] += _broken(self._counts) - _broken(other._counts)
 
     def add_counts(self, other: Decoder) -> None:
         """Add the counts of ``other`` and set them to 0 there."""
+        broken = _broken(other._counts)
         self._numbers[len(_STATE) :] += other._numbers[len(_STATE) :]
         other._numbers[len(_STATE) :] = 0
+        self._state["held_broken"] += broken
+        other._state["held_broken"] -= broken
 
     def is_at(self, other: Decoder) -> bool:
         """Return whether the state is that of ``other``, as far as it matters for what follows."""
-        size = len(_STATE) if self._state["others_parts"] else _STATE.index("others_type")
+        if self._state["held_high"] >= 0:
+            return False
+        last = "held_confirmed" if self._state["others_parts"] else "others_type"
+        size = _STATE.index(last)
         return bool(np.array_equal(self._numbers[:size], other._numbers[:size]))
 
     @property

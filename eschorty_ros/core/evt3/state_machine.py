@@ -45,8 +45,6 @@ _STATE = (
     "high",  # payload of the last TIME_HIGH
     "low",  # payload of the last TIME_LOW
     "held_high",  # TIME_HIGH that awaits confirmation, -1 for none
-    "held_confirmed",  # words that have confirmed it
-    "held_broken",  # broken words before it
     "t_us",  # current time
     "floor_us",  # time of the newest event; time never falls below it
     "row",
@@ -58,6 +56,8 @@ _STATE = (
     "others_type",
     "others_payload",
     "late",  # _IN_TIME; _LATE while the time is past the last to decode, _STOPPED at an event
+    "held_confirmed",  # words that have confirmed ``held_high``
+    "held_broken",  # broken words counted before it
 )
 _IN_TIME, _LATE, _STOPPED = range(3)
 _FOREVER_US = 1 << 62
@@ -148,7 +148,7 @@ def _jump(s, c, q):
     s.low = 0
 
 
-@kernel
+@entry_kernel
 def _broken(c):
     """Return the number of words that no sensor sends where they are."""
     return c.unknown_words + c.legacy_y_words + c.broken_triples + c.broken_continuations

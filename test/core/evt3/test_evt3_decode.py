@@ -318,3 +318,18 @@ def test_time_outlasts_a_stretch_of_random_bytes(size: int) -> None:
     # The events behind the stretch come last, and from 20 ms after it on each has its time.
     behind = t_us[t_us > t_us[-1] - 500_000]
     assert np.array_equal(found.t[-behind.size :], behind)
+
+
+def test_a_copy_goes_on_while_a_jump_awaits_confirmation() -> None:
+    """Whatever each has counted before."""
+    before, after = words_of("8001 9000 9000 002A 8400"), words_of("8400 8401 2805")
+    whole = evt3.Decoder()
+    whole.decode(before)
+    copy = evt3.Decoder()
+    copy.go_on_from(whole)
+    found = copy.decode(after)
+    assert found.t.tolist() == [0x401 << 12]
+    whole.add_counts(copy)
+    whole.go_on_from(copy)
+    assert (whole.time_us, whole.counters.unknown_words) == (0x401 << 12, 2)
+    assert whole.is_at(copy)
