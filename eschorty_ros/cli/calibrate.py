@@ -299,11 +299,13 @@ def _known(distances: str | None, range_sigma: float) -> list[KnownTarget]:
     try:
         ranges = [float(part) for part in distances.rstrip(", ").split(",")]
     except ValueError:
-        if "," in distances and not Path(distances).exists():
+        if ("," in distances or ";" in distances) and not Path(distances).exists():
             raise click.UsageError(
                 f"--distances is {distances}; give millimetres between commas, or a CSV file"
             ) from None
         return read_distances(distances, sigma_range_mm=range_sigma)
+    if len(ranges) < 2:
+        raise click.UsageError(f"--distances is {distances}; give two or more, between commas")
     return [KnownTarget(range_mm, range_sigma) for range_mm in ranges]
 
 

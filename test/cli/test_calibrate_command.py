@@ -54,7 +54,7 @@ def test_targets_become_a_calibration_and_a_page(targets_csv, tmp_path):
     assert done.exit_code == 0, done.output
     assert "rejected: line 5: row" in done.output
     assert "verdict: extrapolates outside 820 to 2050 mm" in done.output
-    assert "verdict: not identifiable, 3 reservations" in done.output
+    assert "verdict: identifiable, 3 reservations" in done.output
     assert done.output.count("verdict: ") == 4
     assert "is replaced" not in done.stderr
     assert "made.yaml of 2" in run(targets_csv, "--nominal", "config_3", "--out", out).stderr
@@ -177,7 +177,9 @@ def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
         ("row,range_mm\n100,900\n,1000\n", "line 3: row is empty"),
         ("row,range_mm\n100,900\n100,900\n", "are the same"),
         (NOT_MOVING, "rows 299.2 to 300.6 at 900 to 1500 mm"),
-        ("row,range_mm\n500,1000\n300,1300\n100,1500\n", "do not determine the build"),
+        ("row,range_mm\n500,1000\n300,1300\n100,1500\n", "rows fall with range"),
+        ("row;range_mm\n100;900\n", "separate columns by commas"),
+        ("row,range_mm\n100,900\n200,1000\n300,1.1\n", "target line 4 is 1.1; give mill"),
     ):
         bad.write_text(text)
         done = run(bad, "--out", out)

@@ -34,7 +34,7 @@ from eschorty_ros.core.calibration.fit import (
     fit,
 )
 from eschorty_ros.core.calibration.residuals import WIDTH_BIAS, Observed
-from eschorty_ros.core.calibration.robust import inliers
+from eschorty_ros.core.calibration.robust import SCALE_MAX, inliers
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import Calibration, RangeModel
 
@@ -49,6 +49,12 @@ _SLOPE_SIGMA_MAX = 1 / 3
 # Ranges that differ by less are one range within their errors.
 _SPAN_SIGMAS = 3.0
 _CHANNELS = ("row", "width", "spacing")
+# Residual that no stated sigma explains: half of a line's width.
+_MISFIT_PX = 10.0
+# Correlation of rows with range beyond which their sense is no error of some.
+_MIRRORED = 0.9
+# Times that a range may be outside those of the design: metres among millimetres are farther.
+_OTHER_UNIT = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +162,8 @@ def calibrate(
     names = checked_free(_free(method, free, targets))
     priors = _priors(method, prior_sigma, names, design)
     check_targets(targets, design, names)
+    _refuse_units(targets, design)
+    _refuse_mirrored(targets, design)
     _refuse_pairs(targets, design)
     _refuse_undetermined(targets, design, names)
     used = np.ones(len(targets), dtype=bool)
@@ -165,6 +173,7 @@ def calibrate(
     kept = targets.select(used)
     found = fit(kept, design, names, prior_sigma=priors)
     _refuse_unmoved(kept, design, found)
+    _refuse_misfit(found)
     lines = verdicts(kept, design, found)
     if rejected:
         labels = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
@@ -218,6 +227,33 @@ def _priors(
     known = {"k_mm": K_PRIOR_SHARE * design.k_mm, **PRIOR_SIGMA}
     priors = {name: known[name] for name in names} | checked_priors(prior_sigma, names)
     return {name: spread for name, spread in priors.items() if spread != math.inf}
+
+
+def _refuse_units(targets: Targets, design: RangeModel) -> None:
+    """Refuse some ranges in another unit than the others; all alike have a line of their own."""
+    near_mm, far_mm = design.range_limits_mm
+    small, large = targets.range_mm < near_mm / _OTHER_UNIT, targets.range_mm > far_mm * _OTHER_UNIT
+    wrong = np.flatnonzero(small | large)
+    if 0 < wrong.size < len(targets):
+        raise ArgumentError(
+            f"range_mm of target {targets.labels[wrong[0]]} is {targets.range_mm[wrong[0]]:g}; "
+            f"give millimetres, {near_mm:.0f} to {far_mm:.0f} by the design"
+        )
+
+
+def _refuse_mirrored(targets: Targets, design: RangeModel) -> None:
+    """Refuse rows that fall with range, which no sensor shows."""
+    if np.ptp(targets.row) * np.ptp(targets.range_mm) == 0.0:
+        return
+    with np.errstate(divide="ignore"):
+        along = np.corrcoef(targets.row, -1.0 / (targets.range_mm + design.b_mm))[0, 1]
+    if along < -_MIRRORED:
+        near, far = (int(pick(targets.range_mm)) for pick in (np.argmin, np.argmax))
+        raise FitError(
+            f"rows fall with range, from {targets.row[near]:.1f} at {targets.range_mm[near]:g} mm "
+            f"to {targets.row[far]:.1f} at {targets.range_mm[far]:g} mm: where they are counted "
+            f"from the sensor's other end write {design.rows - 1} - row, else correct the ranges"
+        )
 
 
 def _refuse_pairs(targets: Targets, design: RangeModel) -> None:
@@ -294,9 +330,19 @@ def _refuse_unmoved(kept: Targets, design: RangeModel, found: CalibrationFit) ->
     )
 
 
+def _refuse_misfit(found: CalibrationFit) -> None:
+    """Refuse targets that are far from any curve; see `inliers` for those of more than four."""
+    times = math.sqrt(found.reduced_chi_square) if found.dof else 0.0
+    if times > SCALE_MAX and np.abs(found.residual_px).max() > _MISFIT_PX:
+        raise FitError(
+            f"the targets contradict each other: they are {times:.0f} times farther from any curve "
+            "than their sigmas allow; check row and range_mm of each"
+        )
+
+
 def _remedy(targets: Targets, design: RangeModel) -> str:
     near_mm, far_mm = design.range_limits_mm
-    if targets.range_mm.max() < near_mm:
+    if targets.range_mm.max() < near_mm or targets.range_mm.min() > far_mm:
         return f"give range_mm in millimetres, {near_mm:.0f} to {far_mm:.0f} by the design"
     return "give targets that move in range"
 
@@ -342,10 +388,10 @@ def _calibration(
     matrix = found.covariance[np.ix_(at, at)]
     matrix = 0.5 * (matrix + matrix.T)
     values: dict[str, Any] = {name: found.values[name] for name in fitted}
-    digest = hashlib.sha256(
-        repr((nominal.name, method, sorted(values.items()), kept.row.tolist(),
-              kept.range_mm.tolist())).encode()
-    )  # fmt: skip
+    # In any order of the targets.
+    rounded = sorted(f"{name} {value:.9g}" for name, value in values.items())
+    rows, ranges = (sorted(each.tolist()) for each in (kept.row, kept.range_mm))
+    digest = hashlib.sha256(repr((nominal.name, method, rounded, rows, ranges)).encode())
     parts = (nominal.name, *((date,) if date else ()), digest.hexdigest()[:8])
     return replace(
         nominal,

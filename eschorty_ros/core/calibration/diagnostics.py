@@ -42,6 +42,9 @@ _PROFILE_SIGMA = 4.0
 _CHI_SQUARE_95 = 3.841
 # A fit in a thousand has a larger chi-square.
 _RARE = 1e-3
+_FREE_THEM = "fit " + " and ".join(COLUMN_TERMS) + ", too (--free)"
+# Times that sigma may be wider with roll and smile free.
+_ROLL_WIDENS = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,15 +132,30 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
     """Return ``identifiable`` where it applies, then each reservation with its remedy."""
     ratios = prior_ratios(found)
     held = {name: ratio for name, ratio in ratios.items() if ratio > _PRIOR_SHARE}
+    # Ranges within those of targets that are far apart hardly depend on b.
+    harmless = {"b_mm"} if np.ptp(targets.row) > 0.5 * design.rows else set()
+    lines = [
+        f"prior dominates {name}: the targets narrow it only to {ratio:.2f} of its prior "
+        f"sigma of {found.prior_sigma[name]:g}"
+        + ("; usual, and ranges hardly depend on it" if name in harmless else _remedy(name))
+        for name, ratio in held.items()
+    ]
+    doubts = [*_pulled(design, found), *_sizes(targets, design, found)]
+    coverage, misfits = _coverage(targets, found), _residuals(targets, found)
+    freed = _with_roll(targets, design, found)
+    if freed is not None:
+        rolled = _rolled(found, freed)
+        doubts += rolled
+        coverage += [] if rolled else _roll_left_out(targets, found, freed)
+    determined = found.condition_number <= CONDITION_WARNING and found.dof > 0
+    if determined and not (set(held) - harmless or doubts or misfits):
+        lines.insert(0, IDENTIFIABLE)
+    return (*lines, *found.verdicts, *doubts, *coverage, *misfits)
+
+
+def _pulled(design: RangeModel, found: CalibrationFit) -> list[str]:
+    """Return a line for each parameter far from its design."""
     lines = []
-    if found.condition_number <= CONDITION_WARNING and found.dof > 0 and not held:
-        lines.append(IDENTIFIABLE)
-    lines += found.verdicts
-    for name, ratio in held.items():
-        lines.append(
-            f"prior dominates {name}: the targets narrow it only to {ratio:.2f} of its prior "
-            f"sigma of {found.prior_sigma[name]:g}{_remedy(name)}"
-        )
     for name, spread in found.prior_sigma.items():
         pull = (found.values[name] - getattr(design, name, 0.0)) / spread
         if abs(pull) > _RESIDUAL_SIGMA:
@@ -145,8 +163,52 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
                 f"{name} is {abs(pull):.1f} prior sigmas from the design; check the nominal "
                 "build or widen its prior"
             )
-    lines += _sizes(targets, design, found)
-    return (*lines, *_coverage(targets, found), *_residuals(targets, found))
+    return lines
+
+
+def _with_roll(
+    targets: Targets, design: RangeModel, found: CalibrationFit
+) -> CalibrationFit | None:
+    """Return the fit with roll and smile free; ``None`` where they are, or columns are unknown."""
+    if np.isnan(targets.column).any() or set(COLUMN_TERMS) & set(found.free):
+        return None
+    priors = found.prior_sigma | {name: PRIOR_SIGMA[name] for name in COLUMN_TERMS}
+    try:
+        return fit(targets, design, [*found.free, *COLUMN_TERMS], prior_sigma=priors)
+    except FitError:
+        return None
+
+
+def _rolled(found: CalibrationFit, freed: CalibrationFit) -> list[str]:
+    """Return a line where roll and smile explain residuals."""
+    from scipy.special import chdtrc
+
+    if chdtrc(2, found.chi_square - freed.chi_square) >= _RARE:
+        return []
+    values = ", ".join(
+        f"{name} {freed.values[name]:+.1f} px with a sigma of {freed.sigmas[name]:.1f}"
+        for name in COLUMN_TERMS
+    )
+    return [f"the sensor is rolled, or the line bent: {values} explain residuals; {_FREE_THEM}"]
+
+
+def _roll_left_out(targets: Targets, found: CalibrationFit, freed: CalibrationFit) -> list[str]:
+    """Return a line where roll and smile within their priors would widen sigma.
+
+    Targets in the order of their ranges across the columns look the same on a sensor that is
+    rolled.
+    """
+    ends_mm = np.array([[targets.range_mm.min()], [targets.range_mm.max()]])
+    columns = np.array([0.0, found.model.principal_column, found.model.columns - 1.0])
+    fixed_mm, freed_mm = (each.range_sigma_mm(ends_mm, columns) for each in (found, freed))
+    worst = np.unravel_index(np.argmax(freed_mm / fixed_mm), freed_mm.shape)
+    if freed_mm[worst] <= _ROLL_WIDENS * fixed_mm[worst]:
+        return []
+    return [
+        f"sigma leaves out roll and smile: with them free it is {freed_mm[worst]:.2g} mm at "
+        f"{ends_mm[worst[0], 0]:.0f} mm in column {columns[worst[1]]:.0f} instead of "
+        f"{fixed_mm[worst]:.2g}; mix the ranges over all columns, or {_FREE_THEM}"
+    ]
 
 
 def _remedy(name: str) -> str:

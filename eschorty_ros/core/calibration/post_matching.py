@@ -26,6 +26,8 @@ _ROW_TOLERANCE_PX = 3.0
 _SIGMAS = 5.0
 # Another assignment must be worse by this factor and this sum, in squared shares of the tolerance.
 _CLEARLY, _CLOSE = 4.0, 0.02
+# Share of the posts, or of the known ones where these are fewer, that chance does not make agree.
+_AGREE_MIN = 2 / 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +189,12 @@ class _LineSearch:
             raise FitError(
                 f"{most} posts agree with the known ranges in more than one way; give sizes, "
                 "pixel hints, or posts at uneven distances"
+            )
+        fewer = min(self._allowed.shape)
+        if most < _AGREE_MIN * fewer:
+            raise FitError(
+                f"{most} of {fewer} posts agree with the known ranges, which any ranges may; check "
+                "them, or give sizes or pixel hints"
             )
         self._line = self._fitted(best)
         return list(best)

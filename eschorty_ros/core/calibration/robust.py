@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 _CUT_SIGMA = 4.0
 # Beyond this many times the stated sigmas the targets contradict each other.
-_SCALE_MAX = 10.0
+SCALE_MAX = 10.0
 # 95 % efficiency on Gaussian errors.
 _CAUCHY = 2.385
 _ITERATIONS = 15
@@ -127,14 +127,15 @@ def _check(distance: Array, known: Mask) -> str:
         for channel, used in enumerate(known.T)
     ]
     return (
-        "ranges, which target is which and sigma_row_px",
+        "ranges, which target is which and sigma_row_px, or fit b_prime_1_px, too, where the "
+        "sensor is rolled",
         "width_px and size_mm",
         "spacing_px and spacing_mm",
     )[int(np.argmax(medians))]
 
 
 def _refuse_contradictions(kept: Mask, scale: float, observed: Observed, check: str) -> None:
-    if scale > _SCALE_MAX:
+    if scale > SCALE_MAX:
         raise FitError(
             f"the targets contradict each other: even the better half is {scale:.0f} times "
             f"farther from any curve than their sigmas allow; check {check}"

@@ -145,7 +145,8 @@ class _Line:
             value = math.nan
         if not math.isfinite(value):
             raise FormatError(
-                f"{self.path} line {self.at}: {name} is {short(text)}; write a number"
+                f"{self.path} line {self.at}: {name} is {short(text)}; write a number, with a "
+                "decimal point"
             )
         return value
 
@@ -169,7 +170,7 @@ def _read(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[_Line
         if len(cells) != len(header):
             raise FormatError(
                 f"{path} line {at}: it has {len(cells)} cells and the header {len(header)}; "
-                "write one for each column, empty where unknown"
+                "write one for each column, empty where unknown, decimals with a point"
             )
         line = _Line(path, at, dict(zip(header, cells, strict=True)))
         for name in needed:
@@ -185,13 +186,18 @@ def _text(path: Path) -> str:
     try:
         return read_regular_file(path, _BYTES_MAX, FormatError).decode("utf-8-sig")
     except UnicodeDecodeError as cause:
-        raise FormatError(f"{path}: it is not text; give a CSV file") from cause
+        raise FormatError(f"{path}: it is not text in UTF-8; save it as CSV in UTF-8") from cause
 
 
 def _check_header(
     path: Path, header: Sequence[str], known: Sequence[str], needed: Sequence[str]
 ) -> None:
     for name in header:
+        if ";" in name or "\t" in name:
+            raise FormatError(
+                f"{path}: its header is {short(name)}; separate columns by commas, and write "
+                "decimals with a point"
+            )
         if name not in known:
             near = get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"choose of {', '.join(known)}"

@@ -285,3 +285,45 @@ def test_sizes_that_contradict_the_k_of_the_papers_method_are_reported():
     for method in ("paper", "joint"):
         assert not any("sizes" in v for v in calibrate(good, NOMINAL, method).verdicts)
     assert not any("sizes" in v for v in calibrate(targets, NOMINAL).verdicts)
+
+
+def on_columns(column, roll_px=0.0):
+    """Posts of ALL_ROWS_MM at columns, on a sensor that is rolled."""
+    bent = replace(TRUTH, b_prime_1_px=roll_px)
+    ranges_mm = np.linspace(840.0, 2000.0, 9)
+    row = bent.row(ranges_mm, column) + np.random.default_rng(SEED).normal(0.0, 0.3, 9)
+    return Targets(row, ranges_mm, 0.3, 1.0, column=column)
+
+
+def test_roll_that_the_columns_show_has_a_verdict_with_its_size():
+    mixed = np.array([1200.0, 60.0, 640.0, 300.0, 1100.0, 150.0, 900.0, 420.0, 760.0])
+    lines = calibrate(on_columns(mixed, 4.0), NOMINAL).verdicts
+    line = next(v for v in lines if v.startswith("the sensor is rolled"))
+    found_px, sigma_px = map(
+        float, re.search(r"b_prime_1_px (\S+) px .*? of (\S+),", line).groups()
+    )
+    assert abs(found_px - 4.0) < 3.0 * sigma_px < 3.0, f"seed {SEED}"
+    assert "identifiable" not in lines
+    straight = calibrate(on_columns(mixed), NOMINAL).verdicts
+    assert straight[0] == "identifiable"
+    assert not [line for line in straight if "roll" in line]
+
+
+def test_ranges_in_the_order_of_the_columns_leave_roll_out_of_sigma():
+    lines = calibrate(on_columns(np.linspace(71.0, 1208.0, 9)), NOMINAL).verdicts
+    assert [line for line in lines if line.startswith("sigma leaves out roll and smile")]
+
+
+@pytest.mark.parametrize("method", ["joint", "paper"])
+def test_few_targets_far_from_any_curve_are_refused(method):
+    targets = posts(ranges_mm=np.array([840.0, 1100.0, 1500.0, 2000.0]))
+    wrong = Targets(targets.row, [840.0, 1100.0, 1500.0, 20_000.0], 0.3, 1.0)
+    with pytest.raises(FitError, match="times farther from any curve"):
+        calibrate(wrong, NOMINAL, method)
+
+
+def test_the_order_of_the_targets_changes_no_name():
+    targets = posts()
+    turned = Targets(targets.row[::-1], targets.range_mm[::-1], targets.sigma_row_px[::-1],
+                     targets.sigma_range_mm[::-1])  # fmt: skip
+    assert calibrate(turned, NOMINAL).calibration.id == calibrate(targets, NOMINAL).calibration.id

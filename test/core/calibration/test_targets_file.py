@@ -80,8 +80,8 @@ def test_distances_with_sizes_and_hints(tmp_path):
         ("row,range_mm\n1,1e999\n", "line 2: range_mm is '1e999'"),
         ("row,range_mm\n1,-5\n", "range_mm of target line 2 is -5; choose a positive range"),
         ('row,range_mm,label\n1,2,"left\n3,4,\n', "line 3: unexpected end of data"),
-        ("row;range_mm\n1;2\n", "column 'row;range_mm' is not known"),
-        (b"\xff\xfe\x00", "not text; give a CSV file"),
+        ("row;range_mm\n1;2\n", "its header is 'row;range_mm'; separate columns by commas"),
+        (b"\xff\xfe\x00", "save it as CSV in UTF-8"),
     ],
 )
 def test_faults_name_file_line_and_column(tmp_path, text, message):
