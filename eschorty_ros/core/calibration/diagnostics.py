@@ -275,7 +275,7 @@ def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
         lines.append(
             f"residuals exceed the stated sigmas: reduced chi-square "
             f"{found.reduced_chi_square:.2f} with {found.dof} degrees of freedom; check the "
-            "targets or state larger sigmas"
+            f"targets, or state sigmas {math.sqrt(found.reduced_chi_square):.1f} times larger"
         )
     ratio = np.abs(found.residual_px) / found.sigma_px
     beyond = np.flatnonzero(ratio > _RESIDUAL_SIGMA)
