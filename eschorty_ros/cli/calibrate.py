@@ -150,7 +150,8 @@ def command(
 
     \b
     Verdicts
-      identifiable        the targets determine every fitted parameter
+      identifiable        the targets determine every fitted parameter, and
+                          nothing speaks against the fit
       prior dominates X   X comes from the design; add targets or spread them
       extrapolates ...    ranges outside of what the targets cover are not backed by them
 
@@ -195,6 +196,7 @@ def command(
     design = load_calibration(nominal)
     # Roll and smile need several targets side by side.
     blocks = _BLOCKS if set(COLUMN_TERMS) & set(free) else 1
+    swept: set[bool] = set()
 
     def targets_of(source: Path) -> Targets:
         if not source.is_dir():
@@ -202,13 +204,22 @@ def command(
         if moving is None:
             return _posts(source, design, distances, range_sigma)
         with _reading(source, design) as (recording, progress):
+            stage_mm = recording.stage_samples["position_mm"]
+            to_and_fro = 2.0 * abs(stage_mm[-1] - stage_mm[0]) < stage_mm.max() - stage_mm.min()
+            swept.update((True, False) if to_and_fro else (bool(stage_mm[-1] > stage_mm[0]),))
             return recorded_moving_target(
                 recording, design, moving, range_per_stage=range_per_stage,
                 sigma_at_zero_mm=range_sigma, blocks=blocks, progress=progress,
             )  # fmt: skip
 
+    targets = Targets.concatenate([targets_of(source) for source in sources])
+    if len(swept) == 1:
+        warn(
+            "the stage moves in one direction only, and a moving line is measured late; give a "
+            "sweep of the other direction, too"
+        )
     report = calibrate(
-        Targets.concatenate([targets_of(source) for source in sources]),
+        targets,
         design,
         method,
         free=free or None,

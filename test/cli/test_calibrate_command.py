@@ -125,6 +125,9 @@ def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
     save_calibration(replace(nominal, name="bench_2"), other)
     warned = run(*folders, *options[:2], "--nominal", other, "--out", tmp_path / "other_made.yaml")
     assert warned.stderr.count("is of the build config_3 and --nominal of bench_2") == 2
+    assert "in one direction only" not in warned.stderr
+    one_way = run(folders[0], *options, "--out", tmp_path / "one_way.yaml")
+    assert "the stage moves in one direction only" in one_way.stderr
     made = made_by(tmp_path / "made.yaml", *folders, *options)
     error = made.model().range_mm(as_built.model().row([1520.0, 1800.0])) - [1520.0, 1800.0]
     print(f"seed {SEED}: range error {error} mm at 1520 and 1800 mm")

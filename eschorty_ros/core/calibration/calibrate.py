@@ -95,7 +95,7 @@ class CalibrationReport:
 
     @property
     def identifiable(self) -> bool:
-        """Return whether the targets determine the build."""
+        """Return whether the targets determine the build, and nothing speaks against the fit."""
         return IDENTIFIABLE in self.verdicts
 
     @property

@@ -27,7 +27,7 @@ from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
 IDENTIFIABLE = "identifiable"
-"""Verdict where the targets determine the build."""
+"""Verdict where the targets determine the build, and nothing speaks against the fit."""
 LISTED = 4
 """Targets that a verdict names."""
 # Above this ratio of standard deviations a prior determines more than the targets.
