@@ -29,8 +29,7 @@ _ROUNDS, _ITERATIONS = 4, 15
 _CONVERGED_SIGMAS = 0.01
 # Neighbours of a normal; its noise must not look like the relief of the surface.
 _NORMAL_NEIGHBOURS = 150
-# Of the noise alone; normals at a rim are one-sided, the same way in both clouds: spheres show 1.4
-# to 5.1, cones of 45 degrees up to 7.3.
+# Of the noise alone, of which surfaces that slide or turn show 0.8 to 2.5.
 _RELIEF_MIN = 10.0
 # Clouds that fit show 0.9 to 1.0 sigma; those that stopped at a wrong pose 2.3 to 10.
 POOR_SIGMAS = 2.0
@@ -81,6 +80,8 @@ class _Shape(NamedTuple):
 
     part: Part
     normals: Array
+    inside: NDArray[np.bool_]
+    """Whether there are points all around: normals at a rim are those of one side."""
 
 
 class _Surface(NamedTuple):
@@ -88,6 +89,7 @@ class _Surface(NamedTuple):
 
     places: cKDTree
     between: LinearNDInterpolator
+    inside: NDArray[np.bool_]
 
 
 class _Pairs(NamedTuple):
@@ -102,6 +104,8 @@ class _Pairs(NamedTuple):
     residual: Array
     sigma: Array
     """Shape (n,). Distance along the normal, and its standard deviation, mm."""
+    inside: NDArray[np.bool_]
+    """Whether both clouds have points all around."""
     centre: Array
     normal_noise: float
     """Standard deviation of a component of the normals."""
@@ -202,7 +206,25 @@ def _shape(open3d: Any, points: NDArray[np.void], origin_mm: Array) -> _Shape:
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(part.xyz))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     normals = np.asarray(cloud.normals)
-    return _Shape(part, normals * -np.sign(normals[:, :1]))
+    return _Shape(part, normals * -np.sign(normals[:, :1]), _inside(part.xyz[:, 1:]))
+
+
+def _inside(places: Array) -> NDArray[np.bool_]:
+    """Return whether a point's neighbours are all around it, shape (n,).
+
+    - ``places``: Shape (n, 2), mm.
+    """
+    from scipy.ndimage import binary_closing, binary_erosion
+
+    low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-9)
+    radius_mm = math.sqrt(_NORMAL_NEIGHBOURS * extent[0] * extent[1] / (math.pi * len(places)))
+    # Three cells to the radius, in a margin that neither step reaches.
+    cell = np.floor((places - low) / radius_mm * 3.0).astype(np.intp) + 4
+    held = np.zeros(cell.max(axis=0) + 5, np.bool_)
+    held[tuple(cell.T)] = True
+    around = np.ones((3, 3), np.bool_)
+    held = binary_erosion(binary_closing(held, around), around, iterations=3)
+    return np.asarray(held[tuple(cell.T)])
 
 
 def _surface(shape: _Shape) -> _Surface:
@@ -215,7 +237,7 @@ def _surface(shape: _Shape) -> _Surface:
         between = LinearNDInterpolator(part.xyz[:, 1:], values)
     except QhullError as error:
         raise ArgumentError("the first cloud is a line; give a cloud of a sweep") from error
-    return _Surface(cKDTree(part.xyz[:, 1:]), between)
+    return _Surface(cKDTree(part.xyz[:, 1:]), between, shape.inside)
 
 
 def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float) -> _Pairs:
@@ -226,12 +248,12 @@ def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float
     """
     turn = transform[:3, :3]
     moved = source.part.xyz @ turn.T + transform[:3, 3]
-    aside, _ = surface.places.query(moved[:, 1:], distance_upper_bound=reach_mm)
+    aside, nearest = surface.places.query(moved[:, 1:], distance_upper_bound=reach_mm)
     ours = np.flatnonzero(np.isfinite(aside))
     fixed = surface.between(moved[ours, 1:])
     inside = np.isfinite(fixed[:, 0])
     ours, fixed = ours[inside], fixed[inside]
-    moved = moved[ours]
+    moved, around = moved[ours], source.inside[ours] & surface.inside[nearest[ours]]
     turned, normals = source.normals[ours] @ turn.T, fixed[:, 1:4]
     turned *= np.sign(np.sum(turned * normals, axis=1))[:, None]
     difference = np.abs(turned - normals)[:, 1:]
@@ -251,13 +273,13 @@ def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float
     noise = SIGMA_PER_MAD * float(np.median(difference[near])) / 2.0
     ratio = np.abs(residual) / sigma
     near &= ratio <= CUT_SIGMA * max(SIGMA_PER_MAD * float(np.median(ratio[near])), 1.0)
-    ours, moved, normals, residual, sigma = (
-        v[near] for v in (ours, moved, normals, residual, sigma)
+    ours, moved, normals, residual, sigma, around = (
+        v[near] for v in (ours, moved, normals, residual, sigma, around)
     )
     centre = moved.mean(axis=0)
     design = np.column_stack([np.cross(moved - centre, normals), normals])
     overlap = found / len(source.part.line)
-    return _Pairs(ours, moved, design, residual, sigma, centre, noise, overlap)
+    return _Pairs(ours, moved, design, residual, sigma, around, centre, noise, overlap)
 
 
 def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> Pose:
@@ -282,7 +304,8 @@ def _refuse_sliding(pairs: _Pairs, rms_sigmas: float) -> None:
 
     At a wrong pose the normals differ as if they were noise.
     """
-    design, sigma = pairs.design, pairs.sigma
+    used = pairs.inside if pairs.inside.any() else slice(None)
+    design, sigma = pairs.design[used], pairs.sigma[used]
     size = float(np.sqrt(np.mean(np.sum(design[:, :3] ** 2, axis=1)) / 2.0)) or 1.0
     scaled = design / np.array([size, size, size, 1.0, 1.0, 1.0]) / sigma[:, None]
     least, axes = np.linalg.eigh(scaled.T @ scaled)

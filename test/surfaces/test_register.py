@@ -89,6 +89,21 @@ def test_surfaces_that_slide_are_refused_whatever_the_noise(surface, words, sigm
         register(*(points[points["column"] < 200] for points in (first, other)))
 
 
+@pytest.mark.parametrize(
+    "surface",
+    [
+        lambda y, z: 1300.0 + 0.6 * np.maximum(0.0, 12.0 - np.abs(z + 25.0)) + 0.0 * y,
+        lambda y, z: 1300.0 + ((y - 20.0) ** 2 + (z + 25.0) ** 2) / 100.0,
+    ],
+    ids=["groove", "bowl"],
+)
+def test_one_sided_normals_at_a_rim_are_no_relief(surface):
+    """Nearly without noise they are most of what a cloud shows that slides or turns."""
+    first, other = (cloud(surface, sigma_mm=0.02, smooth=1, seed=seed) for seed in (2, 3))
+    with pytest.raises(ArgumentError, match="slides along y|turns about x"):
+        register(first, moved(other, known_pose(4)))
+
+
 def test_clouds_apart_are_refused_and_a_start_brings_them_together():
     first, other = cloud(relief), cloud(relief, seed=2)
     away = known_pose(1) @ pose_matrix([200.0, 0.0, 0.0, 0.0, 0.0, 0.0])
