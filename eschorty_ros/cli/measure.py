@@ -64,7 +64,7 @@ def command(
       eschorty measure rec/cloud.pcd --json
     """  # noqa: D301
     from eschorty_ros.core.storage import read_cloud
-    from eschorty_ros.surfaces.measure import measure, parse_region
+    from eschorty_ros.surfaces.measure import faults, measure, parse_region
 
     chosen = tuple(parse_region(text) for text in regions)
     if out is not None:
@@ -75,6 +75,14 @@ def command(
         click.echo(json.dumps(_finite(_facts(measured))))
     else:
         _print(measured, cloud.name)
+        unused = len(points) - int(measured.grid.known.sum())
+        if unused:
+            click.echo(
+                f"{unused:,} of {len(points):,} points are not used: they are flagged mixed or "
+                "sensor_edge, have no place, time or sigma, or share a column and period"
+            )
+    for line in faults(measured):
+        warn(line)
     if out is not None:
         from eschorty_ros.report import figures
         from eschorty_ros.report.surface_figures import measured_figure
@@ -142,12 +150,6 @@ def _print(measured: Measured, title: str) -> None:
             f"{flat.of_plane_mm:.2f}" if math.isfinite(flat.of_plane_mm) else "-",
         )  # fmt: skip
     show(first)
-    bent = [str(n) for n, surface in enumerate(measured.surfaces, 1) if surface.flat.of_no_plane]
-    if bent:
-        warn(
-            f"no plane: {', '.join(bent)}, by flatness; slopes, distances and angles are those of "
-            "the plane that fits best; choose parts with --region"
-        )
     if measured.pairs:
         second = table("", "to surface 1", "distance mm", "angle °", "flush mm", "gap mm")
         for number, pair in enumerate(measured.pairs, 2):

@@ -30,6 +30,8 @@ _MEDIAN_HALF = 2
 _RIM = 3
 # From there to the edge: the rim, the cell beside the step and 4 over which smoothing spreads it.
 _TO_EDGE = _RIM + 5
+# Residuals of a plane over the points' own sigmas, least and most.
+_OWN_SIGMAS = 0.5, 1.5
 
 
 class Region(NamedTuple):
@@ -68,7 +70,8 @@ class Pair(NamedTuple):
     flush_mm: Value
     """Step where the surfaces face each other, along the first one's normal."""
     gap_mm: Value
-    """Space between the facing edges in the first surface; NaN where they overlap."""
+    """Space between the facing edges along y or z; NaN where they overlap, or where points of
+    neither surface are between."""
 
 
 class Measured(NamedTuple):
@@ -126,10 +129,42 @@ def measure(
     surfaces = tuple(
         _surface(grid, mask, common_mm, f"surface {number}") for number, mask in enumerate(masks, 1)
     )
+    others = Part.of(grid, np.zeros_like(grid.known))
     if free is not None:
         surfaces = _to_edges(grid, surfaces, free)
-    pairs = tuple(_pair(surfaces[0], other) for other in surfaces[1:])
+    else:
+        others = Part.of(grid, grid.known & ~np.any(masks, axis=0))
+    pairs = tuple(_pair(surfaces[0], other, others) for other in surfaces[1:])
     return Measured(grid, surfaces, pairs)
+
+
+def faults(measured: Measured) -> list[str]:
+    """Return a line where surfaces are no planes, or scatter otherwise than their points' sigmas.
+
+    A form finer than the cells of the flatness scatters points like errors.
+    """
+    numbered = list(enumerate(measured.surfaces, 1))
+    bent = [str(at) for at, surface in numbered if surface.flat.of_no_plane]
+    found = []
+    if bent:
+        found.append(
+            f"no plane: {', '.join(bent)}, by flatness; slopes, distances and angles are those of "
+            "the plane that fits best; choose parts with --region"
+        )
+    for at, surface in numbered:
+        plane, sigma = surface.plane, surface.part.sigma
+        ratio = float(np.sqrt(np.mean((plane.residual / sigma)[plane.kept] ** 2)))
+        if ratio > _OWN_SIGMAS[1] and not surface.flat.of_no_plane:
+            found.append(
+                f"surface {at}: residuals are {ratio:.1f} times the points' own sigmas; it has "
+                "a form finer than the cells of flatness or two levels, or the sigmas are too small"
+            )
+        elif ratio < _OWN_SIGMAS[0]:
+            found.append(
+                f"surface {at}: residuals are {ratio:.2f} of the points' own sigmas, which are "
+                "too large for them"
+            )
+    return found
 
 
 def _mask(grid: CloudGrid, region: Region) -> NDArray[np.bool_]:
@@ -200,8 +235,8 @@ def _surface(
     return Surface(mask, part, plane, flatness(part, plane), common, part)
 
 
-def _pair(first: Surface, other: Surface) -> Pair:
-    gap, place = _joint(first.whole, other.whole)
+def _pair(first: Surface, other: Surface, others: Part) -> Pair:
+    gap, place = _joint(first.whole, other.whole, others)
     near, near_sigma = first.plane.range_at(*place)
     far, far_sigma = other.plane.range_at(*place)
     cosine = first.plane.cosine
@@ -249,8 +284,11 @@ def _angle(first: Plane, other: Plane) -> Value:
     )
 
 
-def _joint(first: Part, other: Part) -> tuple[Value, tuple[float, float]]:
-    """Return the gap between the facing edges, and y and z of the middle between them."""
+def _joint(first: Part, other: Part, others: Part) -> tuple[Value, tuple[float, float]]:
+    """Return the gap between the facing edges, and y and z of the middle between them.
+
+    There is none where points of ``others``, outside the chosen regions, are between.
+    """
     ends = [np.quantile(part.xyz[:, 1:], (0.0, 1.0), axis=0) for part in (first, other)]
     spaces = np.maximum(ends[1][0] - ends[0][1], ends[0][0] - ends[1][1])
     axis = int(np.argmax(spaces))
@@ -266,7 +304,13 @@ def _joint(first: Part, other: Part) -> tuple[Value, tuple[float, float]]:
     value = float(space.mean()) - pitch
     # An edge is anywhere within one pitch behind the last point.
     sigma = math.sqrt(float(space.var()) / len(space) + pitch**2 / 6.0)
-    gap = Value(value, sigma) if value > -pitch else Value(math.nan, math.nan)
+    ends_mm = np.median(edges, axis=0) + np.array([pitch, -pitch])
+    rows = getattr(others, across)
+    between = (others.xyz[:, 1 + axis] > ends_mm[0]) & (others.xyz[:, 1 + axis] < ends_mm[1])
+    ours = getattr(first, across)
+    between &= (rows >= ours.min()) & (rows <= ours.max())
+    filled = np.count_nonzero(between) > len(edges)
+    gap = Value(value, sigma) if value > -pitch and not filled else Value(math.nan, math.nan)
     return gap, (float(middle[0]), float(middle[1]))
 
 

@@ -16,7 +16,7 @@ from eschorty_ros.core.storage import write_cloud
 from eschorty_ros.core.storage.cloud import SENSOR_EDGE
 from eschorty_ros.simulation.scenes import Steps
 from eschorty_ros.simulation.world import simulate_recording
-from eschorty_ros.surfaces.measure import Region, measure, parse_region
+from eschorty_ros.surfaces.measure import Region, faults, measure, parse_region
 
 ALL = (-np.inf, np.inf)
 
@@ -110,6 +110,28 @@ def test_the_flatness_of_a_plane_holds_its_pocket_however_deep(deep_mm):
     off_mm = flat.value_mm.value - deep_mm * cosine
     assert abs(off_mm) < flat.of_plane_mm + flat.value_mm.sigma
     assert flat.of_no_plane
+
+
+def test_a_form_finer_than_the_cells_has_a_line_and_so_have_sigmas_that_are_too_large():
+    (ripple,) = faults(measure(cloud(lambda y, z: 1300.0 + 0.5 * np.sin(z / 2.0) + 0.0 * y)))
+    assert "surface 1: residuals are" in ripple
+    assert "times the points' own sigmas; it has a form finer" in ripple
+    flat = cloud(lambda y, z: 1300.0 + 0.0 * y * z)
+    assert faults(measure(flat)) == []
+    flat["sigma"] *= 3.0
+    (large,) = faults(measure(flat))
+    assert "of the points' own sigmas, which are too large" in large
+
+
+def test_regions_of_one_plate_have_no_gap_between_them():
+    plate = cloud(lambda y, z: np.where(z < 0.0, 1300.0, 1301.0) + 0.0 * y)
+    regions = (Region((20, 140), ALL), Region((260, 380), ALL))
+    pair = measure(plate, regions).pairs[0]
+    assert np.isnan(pair.gap_mm.value)
+    assert abs(pair.flush_mm.value - 1.0) < 4.0 * pair.flush_mm.sigma
+    apart = plate[(plate["column"] < 141) | (plate["column"] > 259)]
+    gap_mm = measure(apart, regions).pairs[0].gap_mm
+    assert abs(gap_mm.value - 119 * PITCH_Z) < 4.0 * gap_mm.sigma
 
 
 def test_surfaces_gap_step_and_flatness_are_found_without_regions():
