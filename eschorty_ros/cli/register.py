@@ -66,7 +66,13 @@ def command(
     from eschorty_ros.core.storage import is_cloud, read_cloud, write_cloud
     from eschorty_ros.report import figures
     from eschorty_ros.report.surface_figures import joined_figure
-    from eschorty_ros.surfaces.register import POOR_SIGMAS, join, pose_matrix, register
+    from eschorty_ros.surfaces.register import (
+        GOOD_SIGMAS,
+        POOR_SIGMAS,
+        join,
+        pose_matrix,
+        register,
+    )
 
     if len(clouds) < 2 or len(starts) > len(clouds) - 1:
         raise click.UsageError("give two clouds or more, and at most one --start for each further")
@@ -87,6 +93,12 @@ def command(
             except ArgumentError as error:
                 onto = ", ".join(str(path) for path in clouds[: number + 1])
                 raise ArgumentError(f"{clouds[number + 1]} onto {onto}: {error}") from error
+            if pose.rms_sigmas < GOOD_SIGMAS:
+                warn(
+                    f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.2f} sigma (RMS) from "
+                    "the clouds before, where about 1 is right; check that it is another scan, "
+                    "and that sigmas are not too large"
+                )
             if pose.rms_sigmas > POOR_SIGMAS:
                 warn(
                     f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.1f} sigma (RMS) from "

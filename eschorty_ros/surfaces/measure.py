@@ -18,6 +18,7 @@ from eschorty_ros.surfaces.plane import (
     Plane,
     Value,
     check_part,
+    extent_mm,
     fit_plane,
     flatness,
     solve,
@@ -261,7 +262,7 @@ def _distance(first: Part, other: Part, common_mm: float) -> Value:
     gradient = np.array([0.0, cosine, *(-step * slopes * cosine**3)])
     # The shared error of the slopes acts over the distance from one surface to the other.
     apart = np.median(other.xyz[:, 1:], axis=0) - np.median(first.xyz[:, 1:], axis=0)
-    lever = apart / np.ptp(both.xyz[:, 1:], axis=0)
+    lever = apart / extent_mm(both.xyz[:, 1:])
     variance = float(gradient @ fit.covariance @ gradient)
     variance += (common_mm * cosine) ** 2 * (1.0 + float(lever @ lever))
     return Value(float(step) * cosine, math.sqrt(variance))

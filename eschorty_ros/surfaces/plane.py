@@ -122,10 +122,16 @@ def fit_plane(part: Part, common_mm: float) -> Plane:
     middle = np.median(part.xyz[:, 1:], axis=0)
     design = np.column_stack([np.ones(len(part.line)), part.xyz[:, 1:] - middle])
     fit = solve(design, part)
-    extent = np.ptp(part.xyz[:, 1:], axis=0)
+    extent = extent_mm(part.xyz[:, 1:])
     covariance = fit.covariance + np.diag((common_mm / np.array([1.0, *extent])) ** 2)
     centre = np.array([fit.values[0], *middle])
     return Plane(centre, fit.values[1:], covariance, fit.residual, fit.kept)
+
+
+def extent_mm(places: Array) -> Array:
+    """Return the extent of points along each axis, which a stray one does not widen."""
+    low, high = np.quantile(places, (0.01, 0.99), axis=0)
+    return np.asarray((high - low) / 0.98)
 
 
 class Fit(NamedTuple):

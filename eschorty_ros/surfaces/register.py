@@ -16,7 +16,13 @@ from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import organise
-from eschorty_ros.surfaces.plane import COMMON_SHARE, CUT_SIGMA, Part, clustered_covariance
+from eschorty_ros.surfaces.plane import (
+    COMMON_SHARE,
+    CUT_SIGMA,
+    Part,
+    clustered_covariance,
+    extent_mm,
+)
 from eschorty_ros.surfaces.profiles import period_s
 
 if TYPE_CHECKING:
@@ -31,8 +37,10 @@ _CONVERGED_SIGMAS = 0.01
 _NORMAL_NEIGHBOURS = 150
 # Of the noise alone, of which surfaces that slide or turn show 0.8 to 2.5.
 _RELIEF_MIN = 10.0
-# Clouds that fit show 0.9 to 1.0 sigma; those that stopped at a wrong pose 2.3 to 10.
+# Clouds that fit show 0.9 to 1.0 sigma, less where they have points in common; those that stopped
+# at a wrong pose show 2.3 to 10.
 POOR_SIGMAS = 2.0
+GOOD_SIGMAS = 0.5
 _PERIODS_APART = 10
 _WITHOUT_PERIOD_S = 1.0
 
@@ -289,7 +297,7 @@ def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> 
     part = Part(line, column, pairs.moved, pairs.sigma)
     covariance = clustered_covariance(pairs.design, pairs.residual, part)
     common = COMMON_SHARE * float(np.median(pairs.sigma))
-    extent = np.ptp(pairs.moved, axis=0)
+    extent = extent_mm(pairs.moved)
     shared = np.array([0.0, common / extent[2], common / extent[1], common, 0.0, 0.0])
     covariance += np.diag(shared**2)
     metres = transform.copy()

@@ -160,3 +160,11 @@ def test_the_command_joins_clouds(tmp_path):
     assert "shift mm" in printed
     assert "rms/sigma" in printed
     assert f"{out},{out.with_suffix('.png')}:" in "".join(printed.split())
+
+
+def test_the_same_scan_twice_has_a_warning(tmp_path):
+    file = str(tmp_path / "a.ply")
+    write_cloud(file, cloud(relief))
+    done = CliRunner().invoke(main, ["register", file, file, "--out", str(tmp_path / "b.ply")])
+    assert done.exit_code == 0, done.output
+    assert "check that it is another scan" in done.stderr

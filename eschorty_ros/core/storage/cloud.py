@@ -48,7 +48,7 @@ _UNFLAGGED = {
     np.dtype([item for item in kind.descr if item[0] != "flags"]): kind for kind in _DTYPES
 }
 
-_PLY_TYPES = {"f4": "float", "f8": "double", "u2": "ushort"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "u2": "uint16"}
 _HEADER_LIMIT = 4096
 # A PCD of one row is a cloud without order.
 _HEIGHT_MIN = 2
@@ -131,7 +131,9 @@ def stored_points(path: str | os.PathLike[str]) -> Points:
         shape, start = _parse_header(source, head)
         count = math.prod(shape)
         kinds = (*_DTYPES, *_UNFLAGGED)
-        dtype = next((kind for kind in kinds if header(kind, shape) == head[:start]), None)
+        # As PLY files were written before.
+        same = head[:start].replace(b"property ushort ", b"property uint16 ")
+        dtype = next((kind for kind in kinds if header(kind, shape) == same), None)
         expected = 0 if dtype is None else count * dtype.itemsize
         found = os.fstat(stream.fileno()).st_size - start
         if dtype is not None and found == expected:

@@ -39,7 +39,7 @@ def test_point_layout():
     [
         (".pcd", [(b" flags", b""), (b" 2\nTYPE", b"\nTYPE"), (b" U U\n", b" U\n"),
                   (b" 1 1\nWIDTH", b" 1\nWIDTH")]),
-        (".ply", [(b"property ushort flags\n", b"")]),
+        (".ply", [(b"property uint16 flags\n", b"")]),
     ],
 )  # fmt: skip
 def test_a_cloud_written_before_there_were_flags_has_good_points(tmp_path, extension, lines):
@@ -136,8 +136,15 @@ def test_headers_as_written(tmp_path):
     assert (tmp_path / "c.ply").read_bytes()[:-64].decode() == (
         "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
         "property float y\nproperty float z\nproperty float intensity\nproperty float sigma\n"
-        "property double t\nproperty ushort column\nproperty ushort flags\nend_header\n"
+        "property double t\nproperty uint16 column\nproperty uint16 flags\nend_header\n"
     )
+
+
+def test_a_ply_file_with_another_name_of_its_type_is_read(tmp_path):
+    file, points = tmp_path / "c.ply", cloud(7)
+    write_cloud(file, points)
+    file.write_bytes(file.read_bytes().replace(b"property uint16 ", b"property ushort "))
+    np.testing.assert_array_equal(read_cloud(file), points)
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
