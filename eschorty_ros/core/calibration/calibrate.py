@@ -245,8 +245,7 @@ def _refuse_mirrored(targets: Targets, design: RangeModel) -> None:
     """Refuse rows that fall with range, which no sensor shows."""
     if np.ptp(targets.row) * np.ptp(targets.range_mm) == 0.0:
         return
-    with np.errstate(divide="ignore"):
-        along = np.corrcoef(targets.row, -1.0 / (targets.range_mm + design.b_mm))[0, 1]
+    along = np.corrcoef(targets.row, -1.0 / (targets.range_mm + design.b_mm))[0, 1]
     if along < -_MIRRORED:
         near, far = (int(pick(targets.range_mm)) for pick in (np.argmin, np.argmax))
         raise FitError(
