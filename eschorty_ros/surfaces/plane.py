@@ -206,10 +206,10 @@ def check_part(part: Part, name: str) -> None:
             f"{name} has {len(part.line):,} points in {lines} periods and {columns} columns; "
             f"choose a region with {POINTS_MIN} points or more in 3 of each"
         )
-    extent_mm = np.ptp(part.xyz[:, 1:], axis=0)
-    if extent_mm.min() < _EXTENT_MIN_MM:
+    span_mm = np.ptp(part.xyz[:, 1:], axis=0)
+    if span_mm.min() < _EXTENT_MIN_MM:
         raise ArgumentError(
-            f"{name} extends {extent_mm[0]:.3g} mm along y and {extent_mm[1]:.3g} mm along z; "
+            f"{name} extends {span_mm[0]:.3g} mm along y and {span_mm[1]:.3g} mm along z; "
             "a plane needs an extent in both: give a sweep"
         )
 
