@@ -70,6 +70,7 @@ from eschorty_ros.core.line.scatter import (
 )
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth, empty_smoothing
+from eschorty_ros.core.line.two_lines import PROFILES, _single_half, empty_successive
 from eschorty_ros.core.line.unusual import (
     UsualWidths,
     Widths,
@@ -172,6 +173,7 @@ class Memory(NamedTuple):
     scatter: Scatter
     smoothing: Smoothing
     widths: Widths
+    two_lines: NDArray[np.int64]
     history: LineHistory
     light: Light
     delay: Any
@@ -222,6 +224,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
             shape,
         ),
         widths=empty_widths(shape),
+        two_lines=empty_successive(),
         history=empty_history(model.columns, settings.sigma_common_px, windowed),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
@@ -249,6 +252,7 @@ def _begin_window(memory):
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.second_rows[:], memory.columns.events[:] = -1, 0
+    memory.two_lines[:] = 0
     _clear_scatter(memory.scatter)
     _clear_bursts(memory.bursts)
     memory.blink.lines[:] = 0.0
@@ -267,6 +271,38 @@ def _clear_usual(memory):
     memory.widths.usual.number[:], memory.widths.below[:] = 0.0, 0.0
     memory.history.shift_px[:] = 0.0
     _clear_bursts(memory.bursts)
+
+
+@kernel(_nrt=True)
+def _clear_line(memory):
+    """Clear what is known of the line: widths, bursts, delay and footprint."""
+    _clear_usual(memory)
+    memory.delay.time_us = memory.delay.points = 0
+    _restart_from(memory.footprint, memory.known)
+
+
+@kernel(inline="always")
+def _single_where_two(memory, half):
+    """Return what `_single_half` does, 0 for full columns and where the windows are narrow by now.
+
+    Windows of a known width may become as wide as two lines later: three profiles of 16 are tested.
+    """
+    state = memory.state
+    known = state.known_half > 0 and state.profiles % RECENT_PROFILES >= PROFILES
+    if known or not memory.history.windowed:
+        return np.int64(0)
+    return _single_half(memory.columns, half, memory.two_lines)
+
+
+@kernel(_nrt=True)
+def _use_single_line(memory, half):
+    """Begin to search for one line where the windows of this profile had two.
+
+    Its rows are the means of both.
+    """
+    memory.rows.mixed[:] = True
+    memory.state.half, memory.columns.seeds[:] = half, -1
+    _clear_line(memory)
 
 
 @kernel
@@ -341,10 +377,8 @@ def _gate_late(memory):
     columns, gate, counters = memory.columns, memory.gate, memory.counters
     if gate.choices.size > 0:
         if _learn_gate(columns, memory.state.half, memory.smoothing, memory.history, gate):
-            _clear_usual(memory)
             # The events of another gate have another delay and another footprint.
-            memory.delay.time_us = memory.delay.points = 0
-            _restart_from(memory.footprint, memory.known)
+            _clear_line(memory)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
@@ -423,6 +457,7 @@ def _close(memory):
     )
     state.half = _adapted_half(half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
+    single = _single_where_two(memory, half)
     _count(sums, counters)
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     _scale(rows, scatter, smoothing, memory.history.polarities)
@@ -431,6 +466,8 @@ def _close(memory):
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     few = _few_events(rows, smoothing.isolation_events, state)
     _mark_unusual(rows, smoothing, memory.widths, memory.history, few, memory.light.lit_share)
+    if single > 0:
+        _use_single_line(memory, single)
     followed = _points_followed(memory.history)
     counters.points_followed += followed.points
     counters.points_burst_shift += followed.shifted

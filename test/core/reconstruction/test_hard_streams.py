@@ -135,6 +135,29 @@ def test_a_glint_is_flagged_where_it_hides_the_line_and_else_not_taken_for_it(hi
     assert np.mean(found.flags[~off] > 0) < 0.01
 
 
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
+@pytest.mark.parametrize("apart_px", [16.0, -22.0])
+def test_a_reflection_near_the_line_is_not_averaged_with_it(apart_px, frequency_hz):
+    """Both are in one window of the widest line that is expected."""
+    camera = Camera(frequency_hz=frequency_hz, periods=20, half_width_px=4.0)
+    reflection = camera.line(lambda k, c: wavy(k, c) + apart_px, power=0.4)
+    found, _ = points(camera, camera.line(wavy), reflection)
+    separate = found.period > 2
+    assert separate.sum() > 0.99 * 17 * 1280, f"seed {camera.seed}"
+    assert np.mean(np.abs(error_px(found)[separate]) > 1.0) < 0.001
+    assert np.all(found.flags[found.period == 2] & MIXED)
+
+
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
+def test_a_line_that_moves_while_it_is_lit_is_one_line(frequency_hz):
+    """Its ON events are 20 rows from its OFF events."""
+    camera = Camera(frequency_hz=frequency_hz, periods=12, half_width_px=4.0)
+    early, late = (camera.line(lambda k, c, rows=rows: wavy(k, c) + rows) for rows in (-10.0, 10.0))
+    on, off = (tuple(v[part[3] == p] for v in part) for part, p in ((early, 1), (late, 0)))
+    found, _ = points(camera, on, off, phase_gate_us=0)
+    assert np.mean(np.abs(error_px(found)) > 2.0) < 0.05, f"seed {camera.seed}"
+
+
 def test_background_before_the_line_does_not_choose_its_usual_width():
     """Twenty periods of background come first, which has some wide lines by chance."""
     camera = Camera(periods=50, threshold=0.2, events_max=20)

@@ -1,0 +1,99 @@
+"""Two lines in the windows of one, such as the laser's and a reflection beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.estimators import HALF_MIN, HALF_PER_SIGMA
+from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
+
+PROFILES = 3
+"""Successive profiles that show two lines."""
+_COLUMNS = 64
+# Rows of fewer events are apart by chance too often, and so are those of fewer lines.
+_EVENTS_MIN = _LINES_MIN = 8
+# A single line with a dead row has less.
+_VARIANCE_MIN = 4.0
+# Two evenly lit lines with a gap of a third of their length have this share of their variance on
+# either side of the mean: 1 / (1 + 3 (4/3)^2). One evenly lit line has a quarter, a Gaussian more.
+_SIDES = 3.0 / 19.0
+# That of rows within a pixel.
+_PIXEL2 = 1.0 / 12.0
+
+
+def empty_successive() -> NDArray[np.int64]:
+    """Return zeroed counts of profiles, one per column that is tested."""
+    return np.zeros(_COLUMNS, np.int64)
+
+
+@kernel(_nrt=False)
+def _side_sums(packed, start, seed, half, on, parting):
+    """Return number, sum and sum of squares of rows up to ``parting`` and beyond, by polarity.
+
+    Rows are relative to the seed's.
+    """
+    middle = seed >> FRACTION_BITS
+    low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    i = np.uintp(start)
+    while packed[i] != PAD:
+        row = np.int64(packed[i] & ROW_MASK)
+        if abs((row << FRACTION_BITS) - seed) <= half and ((packed[i] & POLARITY) > 0) == on:
+            d = float(row - middle)
+            if d <= parting:
+                low = low[0] + 1.0, low[1] + d, low[2] + d * d
+            else:
+                high = high[0] + 1.0, high[1] + d, high[2] + d * d
+        i += np.uintp(1)
+    return low, high
+
+
+@kernel(_nrt=False)
+def _scatter_of(sums):
+    """Return the sum of squared deviations from the mean."""
+    return sums[2] - sums[1] * sums[1] / max(sums[0], 1.0)
+
+
+@kernel(_nrt=False)
+def _column_sides(packed, start, seed, half):
+    """Return the variance of a column's rows, and that on either side of their mean.
+
+    Events of one polarity count, the one with more: those of a line that moves while it is lit are
+    apart. Zeros where there are too few.
+    """
+    on, _ = _side_sums(packed, start, seed, half, True, np.inf)
+    off, _ = _side_sums(packed, start, seed, half, False, np.inf)
+    more = on if on[0] >= off[0] else off
+    if more[0] < _EVENTS_MIN:
+        return 0.0, 0.0
+    low, high = _side_sums(packed, start, seed, half, on[0] >= off[0], more[1] / more[0])
+    sides = _scatter_of(low) + _scatter_of(high)
+    return _scatter_of(more) / more[0] + _PIXEL2, sides / more[0] + _PIXEL2
+
+
+@kernel(_nrt=False)
+def _single_half(columns, half, successive):
+    """Return the half width of the window of one line where most columns have two in it, else 0.
+
+    Such windows would give the mean of both lines, and go on to be as wide. A column has two lines
+    when three profiles show them, since pixels in the middle of a bright line may answer in every
+    second or third period only. ``successive`` has the number so far, one per column tested.
+    """
+    lines, two, total = 0, 0, 0.0
+    apart = max(columns.seeds.size // successive.size, 1)
+    for k in range(np.uintp(min(successive.size, columns.seeds.size))):
+        c = k * np.uintp(apart)
+        whole, sides = 0.0, 0.0
+        if columns.seeds[c] >= 0:
+            whole, sides = _column_sides(columns.packed, columns.starts[c], columns.seeds[c], half)
+        lines += whole > 0.0
+        has_two = whole > _VARIANCE_MIN and sides < _SIDES * whole
+        successive[k] = successive[k] + 1 if has_two else 0
+        if successive[k] >= PROFILES:
+            two += 1
+            total += sides
+    if 2 * two <= lines or two < _LINES_MIN:
+        return np.int64(0)
+    successive[:] = 0
+    return np.int64(max(np.rint(HALF_PER_SIGMA * np.sqrt(total / two)), HALF_MIN))
