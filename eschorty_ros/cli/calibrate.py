@@ -130,9 +130,9 @@ def command(
     """Calibrate a build on targets at known ranges.
 
     SOURCE is a CSV file of targets or a recording folder; several count together. Writes a
-    calibration.yaml for --calibration of the other commands, and a page with its
-    uncertainty. When the targets do not determine the build nothing is written, and an existing
-    file stays.
+    calibration.yaml for --calibration of scan, simulate, reconstruct and convert, and a page with
+    its uncertainty and verdicts. Where targets are refused nothing is written, and an existing file
+    stays.
 
     \b
     targets.csv   row,range_mm[,row_sigma][,range_sigma_mm][,column]

@@ -40,7 +40,7 @@ _SHOW_S = 0.3
 @click.option(
     "--allow-scan",
     is_flag=True,
-    help="With --live: the page may start scans: light.",
+    help="With --live: the page may start scans, which switch the laser on.",
 )
 @page_options
 def command(

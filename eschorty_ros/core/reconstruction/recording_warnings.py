@@ -97,7 +97,8 @@ def recording_warnings(
         or_slow = f", or the pixels follow one period of {multiple:.0f}" if whole else ""
         found.append(
             f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
-            f"{shown_hz:.4g} Hz; correct it{or_slow}"
+            f"{shown_hz:.4g} Hz; correct it{or_slow}, or where it is right let the camera send "
+            "fewer events: a full readout delays them"
         )
     elif shown_hz is not None:
         duty = shown.duty
