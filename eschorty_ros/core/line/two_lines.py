@@ -14,7 +14,7 @@ PROFILES = 3
 _COLUMNS = 64
 # Rows of fewer events are apart by chance too often, and so are those of fewer lines.
 _EVENTS_MIN = _LINES_MIN = 8
-# A single line with a dead row has less.
+# A narrow line with a dead row in it has less.
 _VARIANCE_MIN = 4.0
 # Two evenly lit lines with a gap of a third of their length have this share of their variance on
 # either side of the mean: 1 / (1 + 3 (4/3)^2). One evenly lit line has a quarter, a Gaussian more.
