@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.pixel_locking import _WHOLE
 
 # Places per row.
 _PLACES = 8
@@ -29,6 +28,8 @@ _NEAR_PLACES = float((_WEIGHTS * _WEIGHTS).sum() / _WEIGHTS.sum())
 _STRUCTURE_MIN = 4.0
 _SYMMETRIC = 0.1
 _ERROR_MAX = 2 * _PLACES
+# Variance of counts that are all the same, which vary by less than a whole one.
+_COUNT2 = 1.0 / 12.0
 # Share of the largest mean count at the ends of a footprint, and the distance of its mean from the
 # middle of these that is a fault: up to 0.2 on symmetric lines, 0.3 to 5 where one side is lost.
 _END_SHARE = 0.2
@@ -87,8 +88,7 @@ def _mean_counts(pixels):
     number = _near_places(number)
     known = np.maximum(number, 1.0)
     mean = _near_places(events) / known
-    # Counts that are all the same vary by less than a whole one.
-    variance = _near_places(squares) / known - mean * mean + _WHOLE
+    variance = _near_places(squares) / known - mean * mean + _COUNT2
     return _Counts(number / _NEAR_PLACES, mean, variance)
 
 

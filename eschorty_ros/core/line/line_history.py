@@ -80,16 +80,13 @@ class BlockMeans(NamedTuple):
 
 
 class PolarityMeans(NamedTuple):
-    """By block, how far rows of ON events are ``apart`` from those of OFF ones, and its square.
+    """By block, how far the ``row`` of a moving line is from the middle of ON and OFF events.
 
-    The ``row`` is how far that of all events is from the middle of the two where the line moves.
-    They are means over recent columns: ``all_columns``, and ``columns`` where it moves.
+    It is a mean over recent ``columns``. The number ``all_columns`` is of moving and still ones.
     """
 
     row: NDArray[np.float64]
     columns: NDArray[np.float64]
-    apart: NDArray[np.float64]
-    apart2: NDArray[np.float64]
     all_columns: NDArray[np.float64]
 
 
@@ -121,7 +118,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((10, blocks)))
-    polarities = PolarityMeans(*np.zeros((5, blocks)))
+    polarities = PolarityMeans(*np.zeros((3, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(
         now, recent, polarities, step_px, shift_px, moved2, passing2, common_px, windowed
@@ -139,11 +136,10 @@ def _restart_history(history):
 
 
 @kernel(_nrt=False)
-def _polarity_rows(packed, start, seed, half):
+def _polarity_row(packed, start, seed, half):
     """Return how far the row of a column's events is from the middle of those of ON and OFF ones.
 
-    The second value is how far these are apart. NaN where one of the two is missing within ``half``
-    of the ``seed``.
+    NaN where one of the two is missing within ``half`` of the ``seed``.
     """
     none = np.int64(0)
     on, off, on_rows, off_rows = none, none, none, none
@@ -158,9 +154,8 @@ def _polarity_rows(packed, start, seed, half):
         off_rows += row if inside & (not is_on) else none
         i += np.uintp(1)
     if min(on, off) == 0:
-        return np.nan, np.nan
-    on_row, off_row = on_rows / on, off_rows / off
-    return (on_rows + off_rows) / (on + off) - 0.5 * (on_row + off_row), on_row - off_row
+        return np.nan
+    return (on_rows + off_rows) / (on + off) - 0.5 * (on_rows / on + off_rows / off)
 
 
 @kernel(_nrt=False)
@@ -171,14 +166,12 @@ def _compare_polarities(columns, half, first, history):
         c = np.uintp((block - 1) * BLOCK_COLUMNS + first)
         if c >= columns.seeds.size or columns.seeds[c] < 0:
             continue
-        row, apart = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
+        row = _polarity_row(columns.packed, columns.starts[c], columns.seeds[c], half)
         if np.isnan(row):
             # Background has the other polarity now and then: most columns decide.
             mean.all_columns[block] = max(mean.all_columns[block] - 1.0, 0.0)
             continue
         mean.all_columns[block] = min(mean.all_columns[block] + 1.0, RECENT_PROFILES)
-        mean.apart[block] += (apart - mean.apart[block]) / mean.all_columns[block]
-        mean.apart2[block] += (apart * apart - mean.apart2[block]) / mean.all_columns[block]
         if history.step_px[block] > 0.0:
             mean.columns[block] = min(mean.columns[block] + 1.0, RECENT_PROFILES)
             mean.row[block] += (row - mean.row[block]) / mean.columns[block]

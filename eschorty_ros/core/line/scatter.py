@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
-from eschorty_ros.core.line.pixel_locking import (
-    _WHOLE,
-    LineEnds,
-    _levels,
-    _pixel_locking_variance,
-    _polarity_variance,
-)
+from eschorty_ros.core.line.pixel_locking import Levels, _clear_levels, empty_levels
 
 # Columns from one to the next of those whose rows, or widths, are compared.
 APART = 5
@@ -50,8 +44,6 @@ _DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
 _TEXTURE_MAX = 4.0
 # Largest factor of a variance, and one over the least.
 FACTOR_MAX = 64.0
-# Largest square of a second difference of lengths that are one of two numbers of pixels.
-_LENGTH2_MAX = 4.0
 
 
 class Differences(NamedTuple):
@@ -65,24 +57,23 @@ class Differences(NamedTuple):
 class Scatter(NamedTuple):
     """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
 
-    ``ends`` are of the differences ``own``. Those of ``near`` and ``far`` are of smoothed rows. A
-    profile has so many edges of the laser as ``laser_edges``.
+    Those of ``near`` and ``far`` are of smoothed rows. No difference shows what the ``levels`` do.
     """
 
     own: Differences
-    ends: LineEnds
     near: Differences
     far: Differences
+    levels: Levels
     factor_max: float
-    laser_edges: int = 2
 
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     own, near, far = np.zeros((3, len(Differences._fields), blocks))
-    ends = LineEnds(*np.zeros((len(LineEnds._fields), blocks)))
-    return Scatter(Differences(*own), ends, Differences(*near), Differences(*far), factor_max)
+    return Scatter(
+        Differences(*own), Differences(*near), Differences(*far), empty_levels(blocks), factor_max
+    )
 
 
 @kernel
@@ -92,8 +83,7 @@ def _clear_scatter(scatter):
         sums.squares[:] = 0.0
         sums.expected[:] = 0.0
         sums.number[:] = 0.0
-    scatter.ends.sizes[:] = 0.0
-    scatter.ends.lengths2[:] = 0.0
+    _clear_levels(scatter.levels)
 
 
 @kernel(inline="always")
@@ -121,38 +111,28 @@ def _usual_ratio(sums, block, least):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, variance, sums, ends):
-    """Add a profile's second differences of rows and of lengths to the sums.
+def _add_differences(row, sigma2, sums):
+    """Add a profile's second differences of rows to the sums.
 
-    Larger ones of rows than scatter has are left out: edges of the surface.
+    Larger ones than scatter has are left out: edges of the surface.
     """
     columns, apart = row.size, APART
     for block in range(1, sums.number.size - 1):
         ratio = _usual_ratio(sums, block, _DIFFERENCES_MIN)
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         first, last = max(begin, apart), min(end, columns - apart)
-        squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
+        squares, expected, number = 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
             square = (row[before] - 2.0 * row[c] + row[after]) ** 2
             expected2 = sigma2[before] + sigma2[after] + 4.0 * sigma2[c]
-            largest2 = max(_PIXEL2, _DEVIATIONS_MAX**2 * ratio * expected2)
-            if square <= largest2:
+            if square <= max(_PIXEL2, _DEVIATIONS_MAX**2 * ratio * expected2):
                 squares += square
                 expected += expected2
                 number += 1.0
-                # Of neighbours: few of them leap to the next pixel, texture moves both.
-                beside = row[c - np.uintp(1)] - 2.0 * row[c] + row[c + np.uintp(1)]
-                sizes += np.sqrt(square if np.isnan(beside) else min(beside * beside, largest2))
-                # The square of a length is 12 variances of evenly lit rows.
-                wider = variance[before] - 2.0 * variance[c] + variance[after]
-                length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
-                lengths2 += min(length2, _LENGTH2_MAX) / 6.0
         _add(squares, block, sums.squares)
         _add(expected, block, sums.expected)
         _add(number, block, sums.number)
-        _add(sizes, block, ends.sizes)
-        _add(lengths2, block, ends.lengths2)
 
 
 @kernel(inline="always")
@@ -222,23 +202,19 @@ def _smoothed_ratio(scatter, block):
 
 
 @kernel(_nrt=False)
-def _scale(rows, scatter, smoothing, polarities):
+def _scale(rows, scatter, smoothing):
     """Scale the variances of a profile by the scatter, and widen the smoothing gates by it.
 
     With a ``factor_max`` of 0, for means over full columns, they are as expected.
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], sums, scatter.ends)
+    _add_differences(rows.row[0], rows.sigma2[0], sums)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, _DIFFERENCES_MIN)
         measured = ratio >= 0.0 and scatter.factor_max > 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
-        levels = _levels(rows, begin, end, scatter.laser_edges)
-        apart2 = _polarity_variance(polarities, block)
-        locking2 = 0.0
-        if measured:
-            locking2 = _pixel_locking_variance(scatter.ends, sums.number, block, levels, apart2)
+        locking2 = scatter.levels.variance[block]
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         # Independent events scatter more than those of pixels, and bound what is not measured.

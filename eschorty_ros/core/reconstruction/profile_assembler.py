@@ -114,7 +114,6 @@ class ProfileAssembler:
                 gate=make_gate(modulation, self._gate_us),
                 blink=blink(modulation, every),
                 light=lit,
-                scatter=self._memory.scatter._replace(laser_edges=2 * every),
             )
         )
         self._state["status"] = CLOSED
@@ -139,7 +138,6 @@ class ProfileAssembler:
                 gate=same_gate(memory.gate),
                 blink=memory.blink._replace(lines=self._memory.blink.lines),
                 light=memory.light,
-                scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
                 known=memory.known,
                 known_widths=memory.known_widths,
                 counters=record(*COUNTERS),

@@ -60,6 +60,7 @@ from eschorty_ros.core.line.line_history import (
     _restart_history,
     empty_history,
 )
+from eschorty_ros.core.line.pixel_locking import _measure_levels
 from eschorty_ros.core.line.scatter import (
     FACTOR_MAX,
     Scatter,
@@ -282,16 +283,15 @@ def _clear_line(memory):
 
 
 @kernel(inline="always")
-def _single_where_two(memory, half):
-    """Return what `_single_half` does, 0 for full columns and where the windows are narrow by now.
+def _is_examined(memory, profiles):
+    """Return whether the events of some columns are examined one by one: until the width is known.
 
-    Windows of a known width may become as wide as two lines later: three profiles of 16 are tested.
+    Later what they show changes slowly: so many ``profiles`` of 16 are enough. Full columns have no
+    line that can be examined.
     """
     state = memory.state
-    known = state.known_half > 0 and state.profiles % RECENT_PROFILES >= PROFILES
-    if known or not memory.history.windowed:
-        return np.int64(0)
-    return _single_half(memory.columns, half, memory.two_lines)
+    known = state.known_half > 0 and state.profiles % RECENT_PROFILES >= profiles
+    return memory.history.windowed and not known
 
 
 @kernel(_nrt=True)
@@ -457,10 +457,15 @@ def _close(memory):
     )
     state.half = _adapted_half(half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > _TOO_WIDE * estimator.half_max
-    single = _single_where_two(memory, half)
     _count(sums, counters)
     counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter, smoothing, memory.history.polarities)
+    single = np.int64(0)
+    if _is_examined(memory, PROFILES):
+        single = _single_half(memory.columns, half, memory.two_lines)
+    if _is_examined(memory, 1):
+        place = (5 * state.profiles) % (BLOCK_COLUMNS - 2)
+        _measure_levels(memory.columns, rows.row[0], half, place, scatter.levels)
+    _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)

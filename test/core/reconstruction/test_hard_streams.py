@@ -811,3 +811,16 @@ def test_sigma_of_a_line_whose_centre_is_beyond_the_sensor_covers_its_error(lit_
     assert len(cut) > 5000, f"seed {camera.seed}"
     assert np.all(cut.flags & SENSOR_EDGE), f"seed {camera.seed}"
     assert np.mean(off < 3.0 * cut.sigma_row) > 0.7, f"seed {camera.seed}"
+
+
+@pytest.mark.parametrize(("threshold", "half_width_px"), [(0.3, 5.5), (0.45, 4.0), (0.6, 5.5)])
+def test_sigma_holds_what_whole_pixels_move_all_columns_by(threshold, half_width_px):
+    """The ends of the line scatter little, and it is nearly parallel to the rows."""
+    camera = Camera(
+        periods=24, threshold=threshold, mismatch=0.03, events_max=12, half_width_px=half_width_px
+    )
+    found, _ = points(camera, camera.line(lambda k, column: 430.0 + column / 320.0 + 0.02 * k))
+    true_row = 430.0 + found.column / 320.0 + 0.02 * found.period
+    deviations = np.abs(found.row - true_row) / found.sigma_row
+    assert np.mean(deviations < 1.0) > 0.45, f"seed {camera.seed}"
+    assert np.mean(deviations < 2.0) > 0.8, f"seed {camera.seed}"
