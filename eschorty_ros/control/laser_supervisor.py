@@ -28,6 +28,7 @@ class LaserSupervisor:
     Two watchdogs run while it is open: one checks the interlock, the other reads the generator back
     and disables the output when that is not what was requested. Commands wait for each other;
     disabling waits for none of them, nor for a callback, and voids those that would lead to light.
+    Any error of the laser's driver ends light, not only an ``EschortyError``.
 
     - ``running``: Whether the process continues; the output is disabled when it does not.
     - ``publish``: Called with the status after every change, in order.
@@ -119,7 +120,7 @@ class LaserSupervisor:
                 return
             try:
                 laser.close()
-            except EschortyError as error:
+            except Exception as error:
                 self._record.lose(error)
                 self.report()
                 raise
@@ -136,7 +137,7 @@ class LaserSupervisor:
             try:
                 laser.configure(modulation)
                 readback = self._checked_readback(laser)
-            except EschortyError as error:
+            except Exception as error:
                 self._record.modulation = before
                 self._disable_failed(error)
                 raise
@@ -171,7 +172,7 @@ class LaserSupervisor:
             try:
                 laser.enable()
                 readback = self._checked_readback(laser)
-            except EschortyError as error:
+            except Exception as error:
                 self._disable_failed(error)
                 raise
             with self._locked():
@@ -196,10 +197,10 @@ class LaserSupervisor:
             laser = self._laser
             if laser is None:
                 return
-            fault: EschortyError | None = None
+            fault: Exception | None = None
             try:
                 laser.disable()
-            except EschortyError as error:
+            except Exception as error:
                 fault = error
             self.switch_offs += self._record.requested is LaserOutput.ON
             self.interlock.note_disabled()
@@ -211,7 +212,7 @@ class LaserSupervisor:
             readback: LaserReadback | None
             try:
                 readback = laser.readback()
-            except EschortyError:
+            except Exception:
                 readback = self._record.assume_off()
             if readback is not None:
                 self._receive(readback)
@@ -298,7 +299,7 @@ class LaserSupervisor:
             raise DeviceError(f"laser: {difference}; look at the generator")
         return readback
 
-    def _disable_failed(self, error: EschortyError) -> None:
+    def _disable_failed(self, error: Exception) -> None:
         """Disable after a command that failed, unless disabling is what made it fail."""
         with self._locked():
             if self._record.requested is LaserOutput.ON:
@@ -340,7 +341,7 @@ class LaserSupervisor:
     def _read_and_compare(self, laser: LaserModulator, ticket: int) -> None:
         try:
             readback = laser.readback()
-        except EschortyError as error:
+        except Exception as error:
             # Disabling may be what interrupted the read-back.
             if not self._in_flight.is_void(ticket) and self.trip(f"not read back: {error}"):
                 self._call(self._alarm, f"laser off: {error}")

@@ -146,6 +146,78 @@ def test_what_to_do_about_an_unknown_output_comes_before_what_tripped_it():
     supervisor.close()
 
 
+class Failing(DelayedLaser):
+    """Its driver fails at the command ``at`` with an error that no driver should raise."""
+
+    at = ""
+
+    def enable(self) -> None:
+        super().enable()
+        self._fail("enable")
+
+    def configure(self, modulation: Modulation) -> None:
+        super().configure(modulation)
+        self._fail("configure")
+
+    def disable(self) -> None:
+        self._fail("disable")
+        super().disable()
+
+    def readback(self) -> LaserReadback:
+        self._fail("readback")
+        return super().readback()
+
+    def _fail(self, command: str) -> None:
+        if self.at == command:
+            raise ValueError(f"{command} failed")
+
+
+@pytest.fixture
+def failing() -> Iterator[tuple[LaserSupervisor, Failing]]:
+    laser = Failing()
+    # Read back once an hour: the commands themselves must disable.
+    supervisor = LaserSupervisor(
+        LaserInterlock(10.0, 60.0, {}), running=lambda: True, publish=lambda _: None, alarm=print,
+        log=print, readback_period_s=3600.0,
+    )  # fmt: skip
+    supervisor.open(laser, Modulation(70.0))
+    supervisor.arm()
+    yield supervisor, laser
+    laser.at = ""
+    supervisor.close()
+
+
+@pytest.mark.parametrize("at", ["enable", "readback"])
+def test_light_ends_when_enabling_fails_with_any_error(failing, at):
+    supervisor, laser = failing
+    laser.at = at
+    with pytest.raises(ValueError, match=f"{at} failed"):
+        supervisor.enable()
+    assert not laser.lit
+    assert supervisor.status().requested is LaserOutput.OFF
+    assert supervisor.status().reason == f"{at} failed"
+
+
+def test_light_ends_when_configuring_fails_with_any_error(failing):
+    supervisor, laser = failing
+    supervisor.enable()
+    laser.at = "configure"
+    with pytest.raises(ValueError, match="configure failed"):
+        supervisor.configure(Modulation(80.0))
+    assert not laser.lit
+    assert supervisor.status().reason == "configure failed"
+
+
+def test_output_is_unknown_when_disabling_fails_with_any_error(failing):
+    supervisor, laser = failing
+    supervisor.enable()
+    laser.at = "disable"
+    with pytest.raises(DeviceError, match="laser state unknown: disable failed"):
+        supervisor.disable("switched off by request")
+    assert supervisor.status().readback.output is LaserOutput.UNKNOWN
+    assert not supervisor.trip("interlock open")
+
+
 def test_arming_does_not_outlive_disabling(supervisor, laser):
     laser.delayed = "arm"
     failures: list[str] = []
