@@ -77,8 +77,12 @@ class ScanRecorder:
         threading.Thread(target=self._work, name="recorder", daemon=True).start()
 
     def made(self, timeout_s: float) -> str:
-        """Wait for the folder; return why there is none, ``""`` when it is there."""
+        """Wait for the folder; return why there is none, ``""`` when it is there.
+
+        A folder that is made later is removed, and nothing is recorded.
+        """
         if not self._made.wait(timeout_s):
+            self.end(None)
             return f"cannot record into {self.folder}: the disk does not answer"
         return self._failure
 

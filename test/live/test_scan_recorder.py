@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import recorded_scan
 from recorded_scan import LiveScan
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import ScanLog, load_recording, read_cloud
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import MARK_DTYPE
-from eschorty_ros.core.storage.recording_writer import RecordingWriter
+from eschorty_ros.core.storage.recording_writer import RecordingWriter, make_recording_folder
+from eschorty_ros.live import scan_recorder
 from eschorty_ros.live.recorded_packets import timed_packets
 from eschorty_ros.live.scan_recorder import ScanRecorder
 
@@ -116,6 +118,24 @@ def test_a_folder_that_cannot_be_made_leaves_no_thread(tmp_path, source):
     fault = recorder.made(5.0)
     assert "cannot" in fault
     assert "being written" not in recorder.wait(0.0)
+
+
+def test_a_folder_that_comes_too_late_is_removed_and_leaves_no_thread(
+    tmp_path, source, monkeypatch
+):
+    answers = threading.Event()
+
+    def slow(folder):
+        assert answers.wait(DEADLINE_S)
+        make_recording_folder(folder)
+
+    monkeypatch.setattr(scan_recorder, "make_recording_folder", slow)
+    log = ScanLog(scan_id="s", start_mm=0.0, stop_mm=1.0)
+    recorder = ScanRecorder(tmp_path / "rec", log, source.calibration, {})
+    assert "the disk does not answer" in recorder.made(0.01)
+    answers.set()
+    assert "being written" not in recorder.wait(DEADLINE_S)
+    assert not (tmp_path / "rec").exists()
 
 
 def test_an_unexpected_error_ends_the_recording_and_not_the_scan(tmp_path, source, monkeypatch):
