@@ -30,74 +30,62 @@ EVENTS = f"{NAMESPACE}/camera/events"
 BOOLEAN = ("true", "false")
 
 
-@dataclass(frozen=True, slots=True)
-class Argument:
-    """An argument of a launch file; one without a default must be given."""
-
-    name: str
-    default: str | None
-    description: str
-    choices: tuple[str, ...] = ()
-
-
 def shared_file(name: str) -> Path:
     """Return a file in ``config/``."""
     return config_path(name) or Path(name)
 
 
 _DEVICES = (
-    Argument("fake", "true", "true: real drivers at an emulated bench; false: at real devices",
-             BOOLEAN),
-    Argument("camera", "true", "false: another driver publishes camera/events", BOOLEAN),
-    Argument("trigger", "stage",
-             "what is wired to the camera's trigger input: none, laser or stage",
-             ("none", "laser", "stage")),
-    Argument("pixels", "paper", "event pixels of an emulated camera", tuple(PRESETS)),
-    Argument("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
-    Argument(
+    Param("fake", "true", "true: real drivers at an emulated bench; false: at real devices",
+          choices=BOOLEAN),
+    Param("camera", "true", "false: another driver publishes camera/events", choices=BOOLEAN),
+    Param("trigger", "stage",
+          "what is wired to the camera's trigger input: none, laser or stage",
+          choices=("none", "laser", "stage")),
+    Param("pixels", "paper", "event pixels of an emulated camera", choices=tuple(PRESETS)),
+    Param("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
+    Param(
         "frequency",
         "70.0",
         "laser modulation, Hz, 16 to 20000; one profile per period, or per several where one has "
         "too few events",
     ),
 )  # fmt: skip
-_FILE = Argument(
+_FILE = Param(
     "parameters",
     str(shared_file("parameters.yaml")),
     "YAML file of parameters by node; what it holds overrides the other arguments",
 )
-_RVIZ = Argument("rviz", "false", "true: show cloud, live profile and frames in RViz", BOOLEAN)
+_RVIZ = Param("rviz", "false", "true: show cloud, live profile and frames in RViz", choices=BOOLEAN)
 
 SCAN = (
     *_DEVICES,
     _FILE,
-    Argument("scene", "steps", f"what stands on an emulated bench: {', '.join(NAMES)} or a mesh"),
-    Argument("calibration", "config_3", "optical build: a name in config/ or the path of a file"),
-    Argument("speed", "0.05", "stage speed, m/s"),
-    Argument("start", "0.01", "stage position where the sweep begins, m"),
-    Argument("stop", "0.11", "stage position where the sweep ends, m"),
-    Argument("auto_scan", "true", "true: scan once when every node is ready", BOOLEAN),
+    Param("scene", "steps", f"what stands on an emulated bench: {', '.join(NAMES)} or a mesh"),
+    Param("calibration", "config_3", "optical build: a name in config/ or the path of a file"),
+    Param("speed", "0.05", "stage speed, m/s"),
+    Param("start", "0.01", "stage position where the sweep begins, m"),
+    Param("stop", "0.11", "stage position where the sweep ends, m"),
+    Param("auto_scan", "true", "true: scan once when every node is ready", choices=BOOLEAN),
     _RVIZ,
 )  # fmt: skip
 CALIBRATE = (
     *_DEVICES,
     _FILE,
-    Argument("scene", "posts", "what stands on an emulated bench: a scene's name or a mesh"),
-    Argument("calibration", "config_3", "optical build as designed: a name in config/ or a file"),
-    Argument("as_built", "config_3_as_built", "build of the emulated bench"),
-    Argument("distances", "posts", "what is known of the targets: a name in config/ or a CSV file"),
-    Argument("method", "joint", "what is fitted: k', b' and more under priors, or k' and b' alone",
-             METHODS),
-    Argument("capture_time", "1.0", "for how long the targets are lit, s"),
-    Argument("calibration_folder", "",
-             "where calibrations are written; empty: eschorty in ~/.ros"),
-    Argument("auto_calibrate", "true", "true: calibrate once when every node is ready; false: wait "
-             "for goals of the action calibrate", BOOLEAN),
+    Param("scene", "posts", "what stands on an emulated bench: a scene's name or a mesh"),
+    Param("calibration", "config_3", "optical build as designed: a name in config/ or a file"),
+    Param("as_built", "config_3_as_built", "build of the emulated bench"),
+    Param("distances", "posts", "what is known of the targets: a name in config/ or a CSV file"),
+    Param("method", "joint", "what is fitted: k', b' and more under priors, or k' and b' alone",
+          choices=METHODS),
+    Param("capture_time", "1.0", "for how long the targets are lit, s"),
+    Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ~/.ros"),
+    Param("auto_calibrate", "true", "true: calibrate once when every node is ready; false: wait "
+          "for goals of the action calibrate", choices=BOOLEAN),
 )  # fmt: skip
 REPLAY = (
-    Argument("recording", None,
-             "folder with events.raw, stage.csv, laser.yaml, calibration.yaml"),
-    Argument("rate", "1.0", "speed of the replay against real time; 0 is as fast as possible"),
+    Param("recording", None, "folder with events.raw, stage.csv, laser.yaml, calibration.yaml"),
+    Param("rate", "1.0", "speed of the replay against real time; 0 is as fast as possible"),
     _FILE,
     _RVIZ,
 )  # fmt: skip
@@ -216,12 +204,10 @@ def _described(given: Mapping[str, str], nodes: Tables, built: str | None) -> De
     return Description(nodes, given["parameters"], bench, view)
 
 
-def _check_choices(arguments: tuple[Argument, ...], given: Mapping[str, str]) -> None:
+def _check_choices(arguments: tuple[Param, ...], given: Mapping[str, str]) -> None:
     for argument in arguments:
         if argument.choices:
-            Param(argument.name, "", "", choices=argument.choices).check(
-                given[argument.name], "argument"
-            )
+            argument.check(given[argument.name], "argument")
 
 
 def _typed(given: Mapping[str, str], node: str, names: tuple[str, ...]) -> dict[str, Any]:

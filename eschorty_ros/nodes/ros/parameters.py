@@ -34,11 +34,14 @@ Value = bool | int | float | str | tuple[int, ...]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Param:
-    """One parameter of a node."""
+    """One parameter of a node, or argument of a launch file."""
 
     name: str
-    default: Value
-    """Its type is the parameter's type; an integer is accepted for a float."""
+    default: Value | None
+    """Its type is the parameter's type; an integer is accepted for a float.
+
+    ``None`` for an argument that must be given.
+    """
     description: str
     unit: str = ""
     """SI."""
