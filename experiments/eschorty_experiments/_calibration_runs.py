@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from eschorty_experiments._measured_posts import measured_posts
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.calibration import (
     K_PRIOR_SHARE,
@@ -19,7 +20,6 @@ from eschorty_ros.core.calibration import (
     fit,
 )
 from eschorty_ros.core.optics import Calibration, RangeModel
-from eschorty_ros.simulation.scenes import measured_posts
 
 CHECK_MM = np.array([800.0, 1000.0, 1320.0, 1700.0, 2100.0])
 FINE_MM = np.linspace(790.0, 2110.0, 34)

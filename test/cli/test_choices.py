@@ -5,10 +5,10 @@ import pytest
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.calibration import METHODS, SIGMA_ROW_PX
+from eschorty_ros.core.calibration.targets_file import SIGMA_RANGE_MM
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 from eschorty_ros.core.reconstruction.settings import KEEP
 from eschorty_ros.live.bag_files import STORAGES
-from eschorty_ros.simulation.scenes.measured_posts import SIGMA_RANGE_MM
 from eschorty_ros.viewer.page import HOST, PORT
 
 

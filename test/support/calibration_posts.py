@@ -4,10 +4,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from eschorty_experiments._measured_posts import measured_posts
 
 from eschorty_ros.core.calibration import Targets
 from eschorty_ros.core.optics import RangeModel, load_calibration
-from eschorty_ros.simulation.scenes import measured_posts
 
 NOMINAL = load_calibration("config_3")
 DESIGN = NOMINAL.model()

@@ -2,7 +2,6 @@
 
 from eschorty_ros.simulation.scenes.face import EAR_OFF_MM, Face
 from eschorty_ros.simulation.scenes.leaves import LEVELS, SEPARATION_MM, Leaves
-from eschorty_ros.simulation.scenes.measured_posts import measured_posts
 from eschorty_ros.simulation.scenes.mesh import Mesh
 from eschorty_ros.simulation.scenes.names import NAMES, RECEDING_MM, named
 from eschorty_ros.simulation.scenes.open3d_module import load_open3d
@@ -29,6 +28,5 @@ __all__ = [
     "WithinRange",
     "bench",
     "load_open3d",
-    "measured_posts",
     "named",
 ]
