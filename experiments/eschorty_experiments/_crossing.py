@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_experiments._line_bench import simulate_line
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import simulate_line
 
 RANGE_MM = 1320.0
 SPEED_MM_S = 300.0

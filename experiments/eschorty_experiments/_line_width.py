@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_experiments._line_bench import simulate_line
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import simulate_line
 
 ROWS, LINE_ROW = 81, 40.0
 SETTLE_US = 20_000

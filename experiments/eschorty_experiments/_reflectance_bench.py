@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from eschorty_experiments._line_bench import simulate_line
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
@@ -14,7 +15,6 @@ from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.report.experiment import Effort
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import simulate_line
 
 FREQUENCIES_HZ = (70.0, 300.0, 1000.0)
 BINS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)

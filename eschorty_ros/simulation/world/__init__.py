@@ -2,7 +2,6 @@
 
 from eschorty_ros.simulation.world.effects import Effects
 from eschorty_ros.simulation.world.footprint import footprint
-from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
 from eschorty_ros.simulation.world.recorder import simulate_recording
 from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, SensorControl, StageTimeline
 from eschorty_ros.simulation.world.warm_up import warm_up
@@ -14,12 +13,10 @@ __all__ = [
     "Effects",
     "Gate",
     "LaserTimeline",
-    "LineEvents",
     "SensorControl",
     "StageTimeline",
     "World",
     "footprint",
-    "simulate_line",
     "simulate_recording",
     "warm_up",
 ]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from eschorty_experiments._line_bench import simulate_line
 from reconstructing import reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
@@ -20,7 +21,6 @@ from eschorty_ros.core.storage import (
     write_cloud,
 )
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import simulate_line
 
 SEED = 20261121
 SIGMA_PX = 4.1

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from eschorty_experiments._line_bench import LineEvents, simulate_line
 from eschorty_experiments._line_width import full_width_half_maximum as fwhm
 from pixel_reference import stepped
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import LineEvents, simulate_line
 
 SEED = 5
 ROWS, CENTRE = 81, 40.0

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from eschorty_experiments._line_bench import LineEvents, simulate_line
 from eschorty_experiments._line_width import full_width_half_maximum as fwhm
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PRESETS, PixelParameters, preset
-from eschorty_ros.simulation.world import LineEvents, simulate_line
 
 SEED = 9
 

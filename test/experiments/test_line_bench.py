@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from eschorty_experiments._line_bench import LineEvents, simulate_line
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PixelParameters
-from eschorty_ros.simulation.world import LineEvents, simulate_line
 
 SEED = 3
 WAVE = Modulation(70.0)
