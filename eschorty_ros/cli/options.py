@@ -41,6 +41,7 @@ _SWEEP = (
     ),
     click.option(
         "--frequency",
+        "frequency_hz",
         type=Number(16, 20_000),
         default=70.0,
         show_default=True,
@@ -49,16 +50,27 @@ _SWEEP = (
     ),
     click.option(
         "--speed",
+        "speed_mm_s",
         type=Number(0, min_open=True),
         default=50.0,
         show_default=True,
         help="Stage speed, mm/s.",
     ),
     click.option(
-        "--start", type=Number(), default=10.0, show_default=True, help="Stage position, mm."
+        "--start",
+        "start_mm",
+        type=Number(),
+        default=10.0,
+        show_default=True,
+        help="Stage position, mm.",
     ),
     click.option(
-        "--stop", type=Number(), default=110.0, show_default=True, help="Stage position, mm."
+        "--stop",
+        "stop_mm",
+        type=Number(),
+        default=110.0,
+        show_default=True,
+        help="Stage position, mm.",
     ),
     click.option(
         "--calibration",

@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -68,24 +68,15 @@ if TYPE_CHECKING:
 )
 @page_options
 def command(
-    scene: str,
-    frequency: float,
-    speed: float,
-    start: float,
-    stop: float,
     calibration: str,
-    pixels: str,
-    effects: str,
-    seed: int,
     keep: str,
     hardware: Path | None,
     out: Path,
-    passes: int,
-    organized: bool,
     record: Path | None,
     live: bool,
     host: str,
     port: int,
+    **scan: Any,
 ) -> None:
     """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
 
@@ -110,7 +101,7 @@ def command(
     from eschorty_ros.core.storage.recording_writer import make_recording_folder
     from eschorty_ros.viewer.page import load_viser, open_when_served, page_url
 
-    check_sweep(start, stop)
+    check_sweep(scan["start_mm"], scan["stop_mm"])
     if hardware is not None:
         refuse_given(("scene", "pixels", "effects", "seed"), "is for a simulated scene")
     if not live:
@@ -119,24 +110,15 @@ def command(
     tables = None
     if hardware is not None:
         tables, calibration, keep = _hardware(hardware, calibration, keep)
-    _check(scene, calibration, effects)
     job = one_scan.ScanJob(
-        scene=scene,
         calibration=calibration,
-        start_mm=start,
-        stop_mm=stop,
-        speed_mm_s=speed,
-        frequency_hz=frequency,
-        seed=seed,
-        pixels=pixels,
-        effects=effects,
         keep=keep,
         hardware=tables,
         record=record,
-        passes=passes,
         page=(host, port) if live else None,
-        organized=organized,
+        **scan,
     )
+    _check(job)
     one_scan.check_job(job)
     if live:
         load_viser()
@@ -177,15 +159,15 @@ def _made(*folders: Path | None) -> Iterator[None]:
         raise
 
 
-def _check(scene: str, calibration: str, effects: str) -> None:
+def _check(job: ScanJob) -> None:
     """Refuse an unknown scene, calibration or effect before any node starts."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.simulation.scenes import named
     from eschorty_ros.simulation.world import Effects
 
-    named(scene)
-    load_calibration(calibration)
-    Effects.parse(effects)
+    named(job.scene)
+    load_calibration(job.calibration)
+    Effects.parse(job.effects)
 
 
 def finish(job: ScanJob, result: ScanResult, out: Path) -> None:

@@ -31,11 +31,11 @@ from eschorty_ros.core.base.files import remove_abandoned
 def command(
     scene: str,
     out: Path,
-    frequency: float,
+    frequency_hz: float,
     duty: float,
-    speed: float,
-    start: float,
-    stop: float,
+    speed_mm_s: float,
+    start_mm: float,
+    stop_mm: float,
     calibration: str,
     pixels: str,
     effects: str,
@@ -52,7 +52,7 @@ def command(
       eschorty simulate --scene sphere --frequency 300 --speed 200 --seed 7 --out rec300
       eschorty simulate --scene plane --effects ambient=0.5,ghost=0.4,ghost_mm=16 --out sunny
     """  # noqa: D301
-    check_sweep(start, stop)
+    check_sweep(start_mm, stop_mm)
     remove_abandoned(out)
     if out.is_dir() and any(out.iterdir()):
         raise ArgumentError(f"{out} is not empty; choose a new folder")
@@ -72,10 +72,10 @@ def command(
             out,
             shown,
             build,
-            modulation=Modulation(frequency, duty),
-            start_mm=start,
-            stop_mm=stop,
-            speed_mm_s=speed,
+            modulation=Modulation(frequency_hz, duty),
+            start_mm=start_mm,
+            stop_mm=stop_mm,
+            speed_mm_s=speed_mm_s,
             seed=seed,
             parameters=preset(pixels),
             effects=Effects.parse(effects),
@@ -87,7 +87,7 @@ def command(
         {
             "events.raw": f"{recording.events_path.stat().st_size / 1e6:.1f} MB",
             **moved,
-            "stage": f"{start:g} to {stop:g} mm at {speed:g} mm/s",
+            "stage": f"{start_mm:g} to {stop_mm:g} mm at {speed_mm_s:g} mm/s",
             "truth": f"{0 if truth is None else len(truth):,} ranges",
         },
     )

@@ -14,7 +14,7 @@ from eschorty_ros.viewer.page import HOST, PORT
 
 def option(command: str, name: str) -> click.Option:
     found = main.get_command(click.Context(main), command)
-    return next(param for param in found.params if param.name == name)
+    return next(param for param in found.params if f"--{name}" in param.opts)
 
 
 @pytest.mark.parametrize(
@@ -36,8 +36,8 @@ def test_frequencies_are_those_of_the_modulation(command):
     [
         ("scan", "host", HOST),
         ("scan", "port", PORT),
-        ("calibrate", "row_sigma", SIGMA_ROW_PX),
-        ("calibrate", "range_sigma", SIGMA_RANGE_MM),
+        ("calibrate", "row-sigma", SIGMA_ROW_PX),
+        ("calibrate", "range-sigma", SIGMA_RANGE_MM),
     ],
 )
 def test_defaults_are_those_of_the_package(command, name, default):
