@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -125,18 +125,11 @@ def scan_once(job: ScanJob, feedback: Progress) -> ScanResult:
                 "no cloud of this scan came on scan/points",
             )
     cloud = _cloud_points(clouds[-1]) if ended.points else np.empty(0, POINT_DTYPE)
+    copied = {field.name for field in fields(ScanResult)} - {"points", "organized"}
     return ScanResult(
-        bool(ended.success),
-        str(ended.message),
-        finite_points(cloud),
-        int(ended.profiles),
-        int(ended.events),
-        int(ended.packets_lost),
-        int(ended.events_dropped),
-        str(ended.verdict),
-        float(ended.completeness),
-        str(ended.recording),
-        cloud if cloud.ndim == 2 else None,
+        points=finite_points(cloud),
+        organized=cloud if cloud.ndim == 2 else None,
+        **{name: getattr(ended, name) for name in copied},
     )
 
 
