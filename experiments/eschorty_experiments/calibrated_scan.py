@@ -66,6 +66,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
     progress(0.6, "target moved by the stage")
     moved = calibrate(_moved(effort, design, built), _narrow(design))
     truth = built.model()
+    near, *_, far = Posts().posts
     return Outcome(
         findings=_findings(report, moved, scan, design.model(), truth),
         tables={"levels": _table(scan)},
@@ -81,8 +82,8 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "As built kk' is 4 % smaller and b' 40 px nearer 0 than designed; posts, staircase and "
             "moved target are simulated with the event pixels of the preset paper, the truth is "
             "known.",
-            f"The posts are at {Posts().known_mm[0]:.0f} to {Posts().known_mm[-1]:.0f} mm and are "
-            "found in the sum of all events. The target moved by the stage is swept forth and back "
+            f"The posts are at {near.range_mm:.0f} to {far.range_mm:.0f} mm and are found "
+            "in the sum of all events. The target moved by the stage is swept forth and back "
             "at two places, with one known range per profile.",
         ],
     )

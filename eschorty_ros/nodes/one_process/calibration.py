@@ -13,10 +13,7 @@ from eschorty_ros.action import Calibrate
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
 from eschorty_ros.core.optics import Calibration, load_calibration
-from eschorty_ros.nodes.one_process.composition import (
-    bench_parameters,
-    composition,
-)
+from eschorty_ros.nodes.one_process.composition import bench_parameters, composition
 from eschorty_ros.nodes.reconstruction.active_calibration import targets_path
 from eschorty_ros.nodes.reconstruction.calibration_messages import target_message
 

@@ -107,11 +107,6 @@ class Posts(UniformReflectance):
         if not self.posts:
             raise ArgumentError("a scene of posts has none; give at least one Post")
 
-    @property
-    def known_mm(self) -> Array:
-        """Ranges of the posts' fronts, shape (n,)."""
-        return np.array([post.range_mm for post in self.posts])
-
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
         """Return ranges as a :class:`Scene`; NaN between the posts."""
         stage, slope = sheet(stage_mm, columns, model)

@@ -17,7 +17,7 @@ COLUMNS = np.arange(1280)
 def test_nine_posts_lie_side_by_side_from_820_to_2050_mm():
     scene = named("posts")
     assert isinstance(scene, Posts)
-    assert scene.known_mm[[0, -1]].tolist() == [820.0, 2050.0]
+    assert [scene.posts[end].range_mm for end in (0, -1)] == [820.0, 2050.0]
     seen = scene.range_mm([0.0, 90.0], COLUMNS, MODEL)
     assert np.array_equal(seen[0], seen[1], equal_nan=True)
     for post in scene.posts:
