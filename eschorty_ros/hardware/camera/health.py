@@ -39,9 +39,12 @@ class HealthMonitor:
 
     def start(self) -> None:
         """Start polling."""
-        self._ending.clear()
         self.note_streaming()
-        self._thread = threading.Thread(target=self._run, name="EVK4 health", daemon=True)
+        # One flag per thread: one that still waits for an answer must not go on with the next one.
+        ending = self._ending = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, args=(ending,), name="EVK4 health", daemon=True
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -104,9 +107,9 @@ class HealthMonitor:
             self.temperature_c = math.nan
             self.failures += 1
 
-    def _run(self) -> None:
+    def _run(self, ending: threading.Event) -> None:
         measured_s = -math.inf
-        while not self._ending.wait(max(self._quiet_at_s - time.monotonic(), _TICK_S)):
+        while not ending.wait(max(self._quiet_at_s - time.monotonic(), _TICK_S)):
             now_s = time.monotonic()
             if now_s > self._quiet_at_s:
                 self._check_streaming()
