@@ -70,10 +70,10 @@ CASES = (
     Case("4 posts, one size", FOUR_MM, {"size_mm": ONE_INCH}),
     Case("6 posts in 1150-1300 mm", SIX_MM, {"size_mm": ONE_INCH}),
 )
-PAPER = Method("paper: k', b'", ("k_prime_px", "b_prime_px"), False)
-FREE_B = Method("b too, no prior", ("k_prime_px", "b_mm", "b_prime_px"), False)
-SIZES = Method("joint, sizes as measured", PARAMETERS, True)
-JOINT = Method("joint, width bias fitted", (*PARAMETERS, WIDTH_BIAS), True)
+PAPER = Method("paper", ("k_prime_px", "b_prime_px"), False)
+FREE_B = Method("b free, no prior", ("k_prime_px", "b_mm", "b_prime_px"), False)
+SIZES = Method("joint, bloom left out", PARAMETERS, True)
+JOINT = Method("joint, bloom fitted", (*PARAMETERS, WIDTH_BIAS), True)
 METHODS = (PAPER, FREE_B, SIZES, JOINT)
 
 
