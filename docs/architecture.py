@@ -24,7 +24,7 @@ BOXES = {
     "cloud": (6, 3.0, "cloud", "core/storage", DATA),
     "stage": (0, 1.5, "DDS220 stage", "hardware/stage", STAGE),
     "clocks": (5, 1.5, "position at\na sensor time", "core/clocks", STAGE),
-    "calibration": (3.5, 4.5, "calibration", "core/calibration", PLAIN),
+    "calibration": (3.5, 4.9, "calibration", "core/calibration", PLAIN),
     "scan": (6, 0.0, "scan sequence", "control", PLAIN),
     "supervisor": (5, 0.0, "interlock,\nsupervisor", "control", LASER),
     "guard": (3, 0.0, "guard process", "hardware/laser_guard", LASER),
@@ -50,7 +50,7 @@ ARROWS = (
 
 def main() -> None:
     """Write the picture beside this file."""
-    figure, axes = plt.subplots(figsize=(15.5, 5.2), dpi=110)
+    figure, axes = plt.subplots(figsize=(15.5, 5.5), dpi=110)
     for place, y, title, where, colour in BOXES.values():
         x = place * PITCH
         axes.add_patch(
@@ -84,20 +84,22 @@ def main() -> None:
             )
         )
         flat = abs(y1 - y0) < 0.1
+        # Beside the arrow, on the side that it leaves free.
+        left = x1 > x0 and y1 > y0
         axes.text(
-            (x0 + x1) / 2 + (0.0 if flat else 0.08),
+            (x0 + x1) / 2 + (0.0 if flat else -0.16 if left else 0.16),
             (y0 + y1) / 2 + (0.12 if flat else 0.0),
             text,
-            ha="center" if flat else "left",
+            ha="center" if flat else "right" if left else "left",
             va="bottom" if flat else "center",
             fontsize=7.5,
             color=colour,
         )
     axes.add_patch(
         FancyBboxPatch(
-            (PITCH - 0.2, 2.72),
+            (PITCH - 0.2, 2.82),
             4 * PITCH + WIDTH + 0.4,
-            1.42,
+            1.32,
             boxstyle="round,pad=0.02",
             facecolor="none",
             edgecolor=DATA,
@@ -114,7 +116,7 @@ def main() -> None:
         va="bottom",
     )
     axes.set_xlim(-0.2, 6 * PITCH + WIDTH + 0.2)
-    axes.set_ylim(-0.25, 5.6)
+    axes.set_ylim(-0.25, 6.0)
     axes.set_axis_off()
     target = Path(__file__).with_suffix(".png")
     figure.savefig(target, bbox_inches="tight", metadata={"Software": ""})
