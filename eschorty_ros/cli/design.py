@@ -69,7 +69,7 @@ _LIGHT_S = 0.5 / 70.0
     "outs",
     multiple=True,
     type=OUT_FILE,
-    help="Also write the plots here, .png, .pdf or .svg, or the build, .yaml.",
+    help="Also write the build, .yaml, or its plots, .png, .pdf or .svg; again for both.",
 )
 def command(
     theta_prime_deg: float | None,

@@ -80,8 +80,8 @@ class Settings:
     noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
     phase_gate_us: int = _number(
         GATE_LEARNED, GATE_LEARNED, GATE_MAX_US, "us",
-        "keep only events this soon after their laser edge; 0 is off, -1 takes the time with which "
-        "rows scatter and lag least, where it halves the square of their error",
+        "keep only events within this time of their laser edge; 0 keeps all, -1 learns the time "
+        "and uses it where the mean square error of rows is halved",
     )  # fmt: skip
     trigger_source: str = _choice(
         "laser", TRIGGER_SOURCES,
