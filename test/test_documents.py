@@ -163,7 +163,7 @@ def test_the_commands_run_in_the_order_of_the_pages(made):
 def test_the_python_examples_run(made):
     (made / "mine").mkdir()
     shutil.copy(made / "rec" / "events.raw", made / "mine")
-    pages = [ROOT / "docs" / f"{name}.md" for name in ("python", "calibration")]
+    pages = [README, *(ROOT / "docs" / f"{name}.md" for name in ("python", "calibration"))]
     found = re.findall(r"```python\n(.*?)```", "\n".join(map(Path.read_text, pages)), re.DOTALL)
     done = subprocess.run(
         [sys.executable, "-c", "".join(found)],
@@ -171,7 +171,7 @@ def test_the_python_examples_run(made):
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count(" points") == 4
+    assert done.stdout.count(" points") == 6
     for name in ("rec/cloud.ply", "mine/cloud.ply"):
         assert (made / name).stat().st_size > 10_000
 
