@@ -127,7 +127,7 @@ def _locking_variance(levels, block):
     The mean size of second differences shows the scatter: their squares would count ends that leap
     to the next pixel by far too much. The mean length over all columns is that of a line at any
     place between two pixels. What it misses, as lengths differ by parts of a pixel from column to
-    column, is half of what levels of random lengths have.
+    column, is half of what levels of random lengths have. No error exceeds half a pixel.
     """
     columns, events = _near_sum(levels.columns, block), _near_sum(levels.events, block)
     first, second, random2 = 0.0, 0.0, 0.0
@@ -144,7 +144,7 @@ def _locking_variance(levels, block):
     together2 = first * first + _SECOND2 * second * second
     # The square of a sine has a mean of a half.
     error2 = 0.5 * (together2 + 0.5 * random2)
-    return error2 / (np.pi * max(events / max(columns, 1.0), 1.0)) ** 2
+    return min(error2 / (np.pi * max(events / max(columns, 1.0), 1.0)) ** 2, 1.0 / 12.0)
 
 
 @kernel(_nrt=False)
