@@ -311,7 +311,7 @@ def _pooled(out, estimator, counts):
 
 @entry_kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
-    """Estimate the rows of every column into ``out`` and empty the columns.
+    """Estimate the rows of every column into ``out``.
 
     Events that do not follow the laser are left out, unless ``blink`` is no test.
     """
@@ -330,7 +330,6 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         _pad(packed, columns.starts[c] + np.int64(columns.counts[c]))
     for c in range(columns.seeds.size):
         n = np.int64(columns.counts[c])
-        columns.counts[c] = 0
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0

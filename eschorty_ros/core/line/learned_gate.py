@@ -3,9 +3,9 @@
 Pixels answer an edge of the laser with a burst of events. Later ones, which they give by themselves
 or long after the edge, say less about where the line is. How long the burst is depends on the
 camera, so gates of several lengths are compared on a profile: by the scatter of the rows of near
-columns, which smoothing reduces, and by the lag behind a line that moves from profile to profile,
-which it does not. No gate is used that moves the rows of near columns together: the line moves
-while it is lit, and what it passes counts, too.
+columns, which smoothing reduces, by the lag behind a line that moves from profile to profile, and
+by what whole pixels move all rows by, which it does not. No gate is used that moves the rows of
+near columns together: the line moves while it is lit, and what it passes counts, too.
 
 Events outside the gate are kept apart, and used in columns that have many of them: a surface that
 is darker or moves more than those of that profile.
@@ -19,6 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.pixel_locking import (
+    _clear_levels,
+    _locking_variance,
+    _measure_levels,
+)
 from eschorty_ros.core.line.scatter import APART, _median_difference
 from eschorty_ros.core.line.window import FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
 from eschorty_ros.core.modulation import Modulation
@@ -202,6 +207,14 @@ def _displacement_px(history):
 
 
 @kernel
+def _locking2(columns, row, half, gate, levels):
+    """Return the variance that all rows of the events in a gate share as pixels are whole."""
+    _clear_levels(levels)
+    _measure_levels(columns, row, half, gate, 0, levels)
+    return _locking_variance(levels, 0, levels.columns.size)
+
+
+@kernel
 def _usual_late(columns, gate):
     """Return the median number of a column's events outside the gate."""
     late = np.zeros(columns.seeds.size, np.int64)
@@ -215,7 +228,7 @@ def _usual_late(columns, gate):
 
 
 @kernel(_nrt=True)
-def _learn_gate(columns, half, smoothing, history, gate):
+def _learn_gate(columns, half, smoothing, history, levels, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
     A gate is chosen again when the line moves twice as fast, in profiles one after the other, or
@@ -242,14 +255,18 @@ def _learn_gate(columns, half, smoothing, history, gate):
     if scatter * FRACTION > half:
         return changed
     averaged = _columns_averaged(smoothing) * _MEDIAN_DIFFERENCE**2
-    best, least2 = 0, _ERROR2_MAX * scatter * scatter
+    locking2 = _locking2(columns, row, half, gate.choices[0], levels)
+    best, least2 = 0, _ERROR2_MAX * (scatter * scatter + averaged * locking2)
     for k in range(1, gate.choices.size):
         if _fill_rows(columns, half, gate.choices[k], gated) < _FOUND_MIN * found:
             # A shorter one keeps fewer.
             break
         scatter = _median_difference(gated)
         error2 = scatter * scatter + averaged * _lag2(row, gated, columns.seeds)
-        if error2 < least2 and not _move_together(gated, row):
+        if error2 >= least2 or _move_together(gated, row):
+            continue
+        error2 += averaged * _locking2(columns, row, half, gate.choices[k], levels)
+        if error2 < least2:
             best, least2 = k, error2
     late = _usual_late(columns, gate.choices[best]) if best > 0 else 0
     # Of columns with more late events than usual all count: where none is usual, of all columns.
@@ -257,6 +274,7 @@ def _learn_gate(columns, half, smoothing, history, gate):
     state.known, state.changed = 1, choice.on_span != state.on_span
     _copy_gate(choice, state)
     state.late, state.half, state.moving = late, half, moving
+    _locking2(columns, row, half, state, levels)
     return changed
 
 

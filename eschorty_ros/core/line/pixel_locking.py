@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
-from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_BITS, ROW_MASK
+from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
+from eschorty_ros.core.line.window import (
+    FRACTION_BITS,
+    POLARITY,
+    ROW_BITS,
+    ROW_MASK,
+    TIME_SHIFT,
+)
+from eschorty_ros.core.modulation.phase_gate import _is_late
 
 # Levels of either polarity that are compared: those above have ends that scatter.
 _LEVELS = 16
@@ -33,21 +40,24 @@ _SURFACE_PX = 1.0
 
 
 class Levels(NamedTuple):
-    """Sums over columns of recent profiles, by block, and by level of light of either polarity.
+    """Sums over columns of recent profiles, by level of light of either polarity.
 
-    ``lengths`` of the line, second differences of its ends, ``leaps``, and their number, by level;
-    numbers of ``columns`` and of their ``events``; and the variance that follows from them.
-    ``mean_length`` is by level, that of all blocks. ``counts``, ``length`` and ``row_sum`` are of
-    the columns at hand.
+    By block: ``lengths`` of the line at each level, numbers of ``columns`` and of their ``events``,
+    and the ``variance`` that follows. By level: second differences of the line's ends, ``leaps``,
+    and their number; what is left of the first term of an end's error in the middle of both, of the
+    ``second`` one, and the mean square of both for any length. ``counts``, ``length`` and
+    ``row_sum`` are of the columns at hand.
     """
 
     lengths: NDArray[np.float64]
-    leaps: NDArray[np.float64]
-    differences: NDArray[np.float64]
     columns: NDArray[np.float64]
     events: NDArray[np.float64]
     variance: NDArray[np.float64]
-    mean_length: NDArray[np.float64]
+    leaps: NDArray[np.float64]
+    differences: NDArray[np.float64]
+    first: NDArray[np.float64]
+    second: NDArray[np.float64]
+    random2: NDArray[np.float64]
     counts: NDArray[np.int64]
     length: NDArray[np.float64]
     row_sum: NDArray[np.float64]
@@ -55,16 +65,18 @@ class Levels(NamedTuple):
 
 def empty_levels(blocks: int) -> Levels:
     """Return no levels; the first and the last block are outside the sensor."""
-    by_level, by_block = np.zeros((3, blocks, 2 * _LEVELS)), np.zeros((3, blocks))
+    by_block, by_level = np.zeros((3, blocks)), np.zeros((5, 2 * _LEVELS))
     length, row_sum = np.zeros((2, 3, 2 * _LEVELS))
     return Levels(
-        lengths=by_level[0],
-        leaps=by_level[1],
-        differences=by_level[2],
+        lengths=np.zeros((blocks, 2 * _LEVELS)),
         columns=by_block[0],
         events=by_block[1],
         variance=by_block[2],
-        mean_length=np.zeros(2 * _LEVELS),
+        leaps=by_level[0],
+        differences=by_level[1],
+        first=by_level[2],
+        second=by_level[3],
+        random2=by_level[4],
         counts=np.zeros((2, 1 << ROW_BITS), np.int64),
         length=length,
         row_sum=row_sum,
@@ -74,86 +86,110 @@ def empty_levels(blocks: int) -> Levels:
 @kernel
 def _clear_levels(levels):
     """Clear all sums."""
-    levels.lengths[:], levels.leaps[:], levels.differences[:] = 0.0, 0.0, 0.0
-    levels.columns[:], levels.events[:], levels.variance[:] = 0.0, 0.0, 0.0
+    levels.lengths[:], levels.columns[:], levels.events[:] = 0.0, 0.0, 0.0
+    levels.variance[:], levels.leaps[:], levels.differences[:] = 0.0, 0.0, 0.0
 
 
 @kernel(_nrt=False)
-def _count_levels(packed, start, seed, half, levels, at):
-    """Find length and sum of rows of the line at each level in a column; return the events."""
+def _count_levels(columns, c, half, gate, levels, at):
+    """Find length and sum of rows of the line at each level in a column; return the events.
+
+    Those within ``half`` of the column's line and in the ``gate`` count.
+    """
     counts, length, row_sum = levels.counts, levels.length[at], levels.row_sum[at]
     length[:], row_sum[:], events = 0.0, 0.0, 0.0
-    i = np.uintp(start)
-    while packed[i] != PAD:
-        row, on = np.int64(packed[i] & ROW_MASK), np.int64((packed[i] & POLARITY) > 0)
-        if abs((row << FRACTION_BITS) - seed) <= half:
+    packed, size = columns.packed, np.uintp(columns.seeds.size)
+    for part in (c, size + c):
+        begin = np.uintp(columns.starts[part])
+        for i in range(begin, begin + np.uintp(columns.counts[part])):
+            v = packed[i]
+            row, on = np.int64(v & ROW_MASK), np.int64((v & POLARITY) > 0)
+            outside = abs((row << FRACTION_BITS) - columns.seeds[c]) > half
+            if outside or _is_late(v >> TIME_SHIFT, v & POLARITY, gate):
+                continue
             level = counts[on, row]
             counts[on, row] += 1
             events += 1.0
             if level < _LEVELS:
                 length[on * _LEVELS + level] += 1.0
                 row_sum[on * _LEVELS + level] += row
-        i += np.uintp(1)
-    i = np.uintp(start)
-    while packed[i] != PAD:
-        counts[:, packed[i] & ROW_MASK] = 0
-        i += np.uintp(1)
+    for part in (c, size + c):
+        begin = np.uintp(columns.starts[part])
+        for i in range(begin, begin + np.uintp(columns.counts[part])):
+            counts[:, packed[i] & ROW_MASK] = 0
     return events
 
 
 @kernel(_nrt=False)
 def _add_ends(levels, block):
-    """Add the three columns at hand to the sums of a block."""
+    """Add the three columns at hand to the sums, lengths to those of a block."""
     length, row_sum = levels.length, levels.row_sum
     for k in range(np.uintp(2 * _LEVELS)):
         lengths = length[0, k] + length[1, k] + length[2, k]
         levels.lengths[block, k] = _KEPT * levels.lengths[block, k] + lengths
-        levels.leaps[block, k] *= _KEPT
-        levels.differences[block, k] *= _KEPT
         if min(length[0, k], length[1, k], length[2, k]) == 0.0:
             continue
         wider = length[0, k] - 2.0 * length[1, k] + length[2, k]
         middle = row_sum[0, k] / length[0, k] + row_sum[2, k] / length[2, k]
         middle -= 2.0 * row_sum[1, k] / length[1, k]
-        levels.leaps[block, k] += min(abs(middle - 0.5 * wider), _LEAP_MAX)
-        levels.leaps[block, k] += min(abs(middle + 0.5 * wider), _LEAP_MAX)
-        levels.differences[block, k] += 2.0
+        levels.leaps[k] += min(abs(middle - 0.5 * wider), _LEAP_MAX)
+        levels.leaps[k] += min(abs(middle + 0.5 * wider), _LEAP_MAX)
+        levels.differences[k] += 2.0
 
 
 @kernel(_nrt=False)
-def _locking_variance(levels, block):
-    """Return the variance that rows near a block share, 0 where no column has been seen.
+def _find_terms(levels):
+    """Find what is left of the error of a line's ends in their middle, by level.
 
     The mean size of second differences shows the scatter: their squares would count ends that leap
     to the next pixel by far too much. The mean length over all columns is that of a line at any
-    place between two pixels. What it misses, as lengths differ by parts of a pixel from column to
-    column, is half of what levels of random lengths have. No error exceeds half a pixel.
+    place between two pixels.
     """
-    columns, events = _near_sum(levels.columns, block), _near_sum(levels.events, block)
-    first, second, random2 = 0.0, 0.0, 0.0
+    columns = max(levels.columns.sum(), 1.0)
     for k in range(np.uintp(2 * _LEVELS)):
-        differences = _near_sum(levels.differences[:, k], block)
-        if differences == 0.0:
-            continue
-        size = _near_sum(levels.leaps[:, k], block) / differences
+        size = levels.leaps[k] / max(levels.differences[k], 1.0)
         dithered = np.exp(-2.0 * np.pi**2 * _SQUARE_PER_SIZE2 * size * size / 6.0)
-        share = _near_sum(levels.lengths[:, k], block) / columns * dithered
-        first += share * np.cos(np.pi * levels.mean_length[k])
-        second += share * dithered**3 * np.cos(2.0 * np.pi * levels.mean_length[k])
-        random2 += 0.5 * share * share * (1.0 + _SECOND2 * dithered**6)
-    together2 = first * first + _SECOND2 * second * second
-    # The square of a sine has a mean of a half.
-    error2 = 0.5 * (together2 + 0.5 * random2)
-    return min(error2 / (np.pi * max(events / max(columns, 1.0), 1.0)) ** 2, 1.0 / 12.0)
+        dithered *= levels.differences[k] > 0.0
+        length = levels.lengths[:, k].sum() / columns
+        levels.first[k] = dithered * np.cos(np.pi * length)
+        levels.second[k] = dithered**4 * np.cos(2.0 * np.pi * length)
+        levels.random2[k] = 0.5 * (dithered**2 + _SECOND2 * dithered**8)
 
 
 @kernel(_nrt=False)
-def _measure_levels(columns, row, half, place, levels):
+def _locking_variance(levels, begin, end):
+    """Return the variance that the rows of some blocks share, 0 where none has been measured.
+
+    What mean lengths miss, as a line's length differs by parts of a pixel from column to column, is
+    half of what levels of random lengths have. No error exceeds half a pixel.
+    """
+    first, second, random2, events = 0.0, 0.0, 0.0, 0.0
+    for block in range(begin, end):
+        events += levels.events[block]
+    for k in range(np.uintp(2 * _LEVELS)):
+        length = 0.0
+        for block in range(begin, end):
+            length += levels.lengths[block, k]
+        share = length / max(events, 1.0)
+        first += share * levels.first[k]
+        second += share * levels.second[k]
+        random2 += share * share * levels.random2[k]
+    error2 = first * first + _SECOND2 * second * second + 0.5 * random2
+    # The square of a sine has a mean of a half.
+    return min(0.5 * error2 / np.pi**2, 1.0 / 12.0)
+
+
+@kernel(_nrt=False)
+def _measure_levels(columns, row, half, gate, place, levels):
     """Add three columns next to each other of each block, from its column ``place`` on.
 
-    Columns of two surfaces, or without a line, are left out.
+    Columns of two surfaces, or without a line, are left out, and events outside the ``gate``.
     """
-    for block in range(1, levels.columns.size - 1):
+    for k in range(np.uintp(2 * _LEVELS)):
+        levels.leaps[k] *= _KEPT
+        levels.differences[k] *= _KEPT
+    blocks = levels.columns.size
+    for block in range(1, blocks - 1):
         first = np.uintp((block - 1) * BLOCK_COLUMNS + place)
         last = first + np.uintp(2)
         if last >= row.size:
@@ -164,13 +200,9 @@ def _measure_levels(columns, row, half, place, levels):
         levels.columns[block] = _KEPT * levels.columns[block] + 3.0
         events = 0.0
         for at in range(np.uintp(3)):
-            c = first + at
-            events += _count_levels(
-                columns.packed, columns.starts[c], columns.seeds[c], half, levels, at
-            )
+            events += _count_levels(columns, first + at, half, gate, levels, at)
         levels.events[block] = _KEPT * levels.events[block] + events
         _add_ends(levels, block)
-    for k in range(levels.mean_length.size):
-        levels.mean_length[k] = levels.lengths[:, k].sum() / max(levels.columns.sum(), 1.0)
-    for block in range(1, levels.columns.size - 1):
-        levels.variance[block] = _locking_variance(levels, block)
+    _find_terms(levels)
+    for block in range(1, blocks - 1):
+        levels.variance[block] = _locking_variance(levels, block - 1, block + 2)

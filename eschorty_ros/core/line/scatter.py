@@ -214,7 +214,6 @@ def _scale(rows, scatter, smoothing):
         ratio = _ratio(sums, block, _DIFFERENCES_MIN)
         measured = ratio >= 0.0 and scatter.factor_max > 0.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
-        locking2 = scatter.levels.variance[block]
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         # Independent events scatter more than those of pixels, and bound what is not measured.
@@ -227,7 +226,17 @@ def _scale(rows, scatter, smoothing):
                 gate_px = max(smoothing.gate_px, scattered)
                 smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px
                 rows.sigma2[k, c] = factor * sigma2
-                rows.common2[k, c] += 0.0 if cut else locking2
+
+
+@kernel(inline="always")
+def _left_of_locking(row, used, c):
+    """Return the share of the variance of whole pixels that smoothing leaves where rows slope.
+
+    The mean of a sine over a share w of its period is off by sin(pi w) / (pi w).
+    """
+    reach = np.uintp(0.5 * used[c])
+    way = row[min(c + reach, np.uintp(row.size - 1))] - row[c - min(reach, c)]
+    return 1.0 if np.isnan(way) else 1.0 / (1.0 + np.pi**2 / 3.0 * way * way)
 
 
 @kernel(_nrt=False)
@@ -248,6 +257,9 @@ def _scale_smoothed(rows, scatter, smoothing):
             for c in range(
                 np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
             ):
+                if not rows.truncated[k, c]:
+                    left2 = _left_of_locking(smoothing.row[k], smoothing.used[k], c)
+                    rows.common2[k, c] += left2 * scatter.levels.variance[block]
                 own2, common2 = sigma2[k, c], rows.common2[k, c]
                 measured2 = max(common2, factor * own2)
                 sigma2[k, c] = measured2 if ratio >= 0.0 else common2 + own2

@@ -376,7 +376,8 @@ def _gate_late(memory):
     """Leave out the late events that are not the line's, where the phase of the light is gated."""
     columns, gate, counters = memory.columns, memory.gate, memory.counters
     if gate.choices.size > 0:
-        if _learn_gate(columns, memory.state.half, memory.smoothing, memory.history, gate):
+        half, levels = memory.state.half, memory.scatter.levels
+        if _learn_gate(columns, half, memory.smoothing, memory.history, levels, gate):
             # The events of another gate have another delay and another footprint.
             _clear_line(memory)
         gated = _use_late(columns, gate)
@@ -464,11 +465,12 @@ def _close(memory):
         single = _single_half(memory.columns, half, memory.two_lines)
     if _is_examined(memory, 1):
         place = (5 * state.profiles) % (BLOCK_COLUMNS - 2)
-        _measure_levels(memory.columns, rows.row[0], half, place, scatter.levels)
+        _measure_levels(memory.columns, rows.row[0], half, memory.gate.state, place, scatter.levels)
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
+    memory.columns.counts[:] = 0
     few = _few_events(rows, smoothing.isolation_events, state)
     _mark_unusual(rows, smoothing, memory.widths, memory.history, few, memory.light.lit_share)
     if single > 0:

@@ -824,3 +824,21 @@ def test_sigma_holds_what_whole_pixels_move_all_columns_by(threshold, half_width
     deviations = np.abs(found.row - true_row) / found.sigma_row
     assert np.mean(deviations < 1.0) > 0.45, f"seed {camera.seed}"
     assert np.mean(deviations < 2.0) > 0.8, f"seed {camera.seed}"
+
+
+@pytest.mark.parametrize("mismatch", [0.03, 0.1])
+def test_no_gate_is_used_that_makes_whole_pixels_worse(mismatch):
+    """Late events are those of further levels of light, each with ends of its own.
+
+    Without them rows of near columns scatter less, and all of them are further off.
+    """
+    camera = Camera(
+        frequency_hz=300.0, periods=24, threshold=0.6, mismatch=mismatch, events_max=12,
+        half_width_px=4.0, delay_us=67.0, jitter_us=10.0,
+    )  # fmt: skip
+    parts = camera.line(lambda k, column: 430.0 + column / 320.0 + 0.02 * k), camera.scattered(2e6)
+    found, all_events = points(camera, *parts)[0], points(camera, *parts, phase_gate_us=0)[0]
+    errors_px = [
+        np.std(one.row - one.column / 320.0 - 0.02 * one.period) for one in (found, all_events)
+    ]
+    assert errors_px[0] < 1.2 * errors_px[1], f"seed {camera.seed}"
