@@ -31,8 +31,9 @@ _LEVELS = 16
 _KEPT = 1.0 - 1.0 / 8.0
 # The squared second term, which stands for all that follow: 1/4 + 1/9 + ...
 _SECOND2 = np.pi**2 / 6.0 - 1.0
-# Mean square of a normal distribution over that of its mean size.
-_SQUARE_PER_SIZE2 = 0.5 * np.pi
+# Variance s^2 of an end over the square of the mean size of its leaps, 4 s / sqrt(pi) for ends
+# anywhere between two pixels. Their mean square would count those that leap by far too much.
+_END2_PER_LEAP2 = np.pi / 16.0
 # Largest second difference of ends, px: scatter of so much leaves nothing of the error.
 _LEAP_MAX = 2.0
 # Second difference of rows that are those of one surface, px.
@@ -141,14 +142,13 @@ def _add_ends(levels, block):
 def _find_terms(levels):
     """Find what is left of the error of a line's ends in their middle, by level.
 
-    The mean size of second differences shows the scatter: their squares would count ends that leap
-    to the next pixel by far too much. The mean length over all columns is that of a line at any
-    place between two pixels.
+    Leaps show the ends' scatter. The mean length over all columns is that of a line at any place
+    between two pixels.
     """
     columns = max(levels.columns.sum(), 1.0)
     for k in range(np.uintp(2 * _LEVELS)):
-        size = levels.leaps[k] / max(levels.differences[k], 1.0)
-        dithered = np.exp(-2.0 * np.pi**2 * _SQUARE_PER_SIZE2 * size * size / 6.0)
+        leap = levels.leaps[k] / max(levels.differences[k], 1.0)
+        dithered = np.exp(-2.0 * np.pi**2 * _END2_PER_LEAP2 * leap * leap)
         dithered *= levels.differences[k] > 0.0
         length = levels.lengths[:, k].sum() / columns
         levels.first[k] = dithered * np.cos(np.pi * length)
