@@ -257,6 +257,7 @@ def _learn_gate(columns, half, smoothing, history, levels, gate):
     averaged = _columns_averaged(smoothing) * _MEDIAN_DIFFERENCE**2
     locking2 = _locking2(columns, row, half, gate.choices[0], levels)
     best, least2 = 0, _ERROR2_MAX * (scatter * scatter + averaged * locking2)
+    measured = 0
     for k in range(1, gate.choices.size):
         if _fill_rows(columns, half, gate.choices[k], gated) < _FOUND_MIN * found:
             # A shorter one keeps fewer.
@@ -266,15 +267,18 @@ def _learn_gate(columns, half, smoothing, history, levels, gate):
         if error2 >= least2 or _move_together(gated, row):
             continue
         error2 += averaged * _locking2(columns, row, half, gate.choices[k], levels)
+        measured = k
         if error2 < least2:
             best, least2 = k, error2
     late = _usual_late(columns, gate.choices[best]) if best > 0 else 0
     # Of columns with more late events than usual all count: where none is usual, of all columns.
-    choice = gate.choices[best if late > 0 else 0]
+    chosen = best if late > 0 else 0
+    choice = gate.choices[chosen]
     state.known, state.changed = 1, choice.on_span != state.on_span
     _copy_gate(choice, state)
     state.late, state.half, state.moving = late, half, moving
-    _locking2(columns, row, half, state, levels)
+    if measured != chosen:
+        _locking2(columns, row, half, choice, levels)
     return changed
 
 

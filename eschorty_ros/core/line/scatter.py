@@ -228,13 +228,14 @@ def _scale(rows, scatter, smoothing):
                 rows.sigma2[k, c] = factor * sigma2
 
 
-@kernel(inline="always")
-def _left_of_locking(row, used, c):
+@kernel(_nrt=False)
+def _left_of_locking(row, used, column):
     """Return the share of the variance of whole pixels that smoothing leaves where rows slope.
 
     The mean of a sine over a share w of its period has sin(x) / x of it, with x = pi w. One over
     the square of that is 1 + x^2 / 3 + x^4 / 15, to this order.
     """
+    c = np.uintp(column)
     reach = np.uintp(0.5 * used[c])
     way = row[min(c + reach, np.uintp(row.size - 1))] - row[c - min(reach, c)]
     x2 = (np.pi * way) ** 2
@@ -255,13 +256,12 @@ def _scale_smoothed(rows, scatter, smoothing):
     for block in range(1, near.number.size - 1):
         ratio = _smoothed_ratio(scatter, block)
         factor = min(ratio, scatter.factor_max)
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         for k in range(returns):
-            for c in range(
-                np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
-            ):
-                if not rows.truncated[k, c]:
-                    left2 = _left_of_locking(smoothing.row[k], smoothing.used[k], c)
-                    rows.common2[k, c] += left2 * scatter.levels.variance[block]
+            left2 = _left_of_locking(smoothing.row[k], smoothing.used[k], (begin + end) // 2)
+            locking2 = left2 * scatter.levels.variance[block]
+            for c in range(np.uintp(begin), np.uintp(end)):
+                rows.common2[k, c] += 0.0 if rows.truncated[k, c] else locking2
                 own2, common2 = sigma2[k, c], rows.common2[k, c]
                 measured2 = max(common2, factor * own2)
                 sigma2[k, c] = measured2 if ratio >= 0.0 else common2 + own2
