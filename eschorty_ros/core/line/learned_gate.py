@@ -232,7 +232,8 @@ def _learn_gate(columns, half, smoothing, history, levels, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
     A gate is chosen again when the line moves twice as fast, in profiles one after the other, or
-    rests behind a leap. Returns true in the profile behind the one that changes the gate.
+    rests behind a leap. The ``levels`` are then those of its events. Returns true in the profile
+    behind the one that changes the gate.
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0
