@@ -62,7 +62,7 @@ _WAITING_S, _IDLE_S = POINTS_INTERVAL_S, 1.0
 # Packets that have queued up are worked on in parts: all together would take 100 MB for a second.
 _JOBS_PER_STEP = 32
 # A step costs as much as the events of some packets of 1 ms; they wait for each other this long.
-_STEP_S = 0.004
+_STEP_S = 0.003
 # Loading the compiled kernels takes less.
 _COMPILING_S = 5.0
 # Longest time between two clocks that are read together.
