@@ -9,7 +9,6 @@ from eschorty_ros.core.line.estimators import (
     check_method,
 )
 from eschorty_ros.core.line.independent_columns import Centroids, estimate
-from eschorty_ros.core.line.line_history import SIGMA_COMMON_PX
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
 from eschorty_ros.core.line.sigma import SIGMA_FLOOR_PX
 from eschorty_ros.core.line.window import HALF_WIDTH_PER_FWHM, TIME_LIMIT_US
@@ -22,7 +21,6 @@ __all__ = [
     "METHODS",
     "RETURNS",
     "ROOT_12",
-    "SIGMA_COMMON_PX",
     "SIGMA_FLOOR_PX",
     "TIME_LIMIT_US",
     "Centroids",

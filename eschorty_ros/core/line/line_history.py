@@ -28,8 +28,6 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
-# Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.
-SIGMA_COMMON_PX = 0.04
 # Larger differences from profile to profile are those of another surface, unless all columns have
 # them.
 _JITTER_MAX_PX = 1.0
@@ -94,10 +92,9 @@ class LineHistory(NamedTuple):
     """Sums of a profile and means of the recent ones, and the variances that follow from them.
 
     The first and the last block are outside the sensor. The line moves by ``step_px`` from profile
-    to profile, a mean over recent ones. A line that moves is off by the standard deviation
-    ``common_px`` and by what the rows of its ``polarities`` show, at most. With what its bursts
-    show, ``shift_px``, that is the variance ``moved2``; ``passing2`` is that of an edge that it
-    passes.
+    to profile, a mean over recent ones. A line that moves is off by what the rows of its
+    ``polarities`` show, at most. With what its bursts show, ``shift_px``, that is the variance
+    ``moved2``; ``passing2`` is that of an edge that it passes.
     """
 
     now: BlockSums
@@ -107,11 +104,10 @@ class LineHistory(NamedTuple):
     shift_px: NDArray[np.float64]
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
-    common_px: float
     windowed: bool
 
 
-def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory:
+def empty_history(columns: int, windowed: bool) -> LineHistory:
     """Return the history of a line before its first profile.
 
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
@@ -120,9 +116,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((10, blocks)))
     polarities = PolarityMeans(*np.zeros((3, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
-    return LineHistory(
-        now, recent, polarities, step_px, shift_px, moved2, passing2, common_px, windowed
-    )
+    return LineHistory(now, recent, polarities, step_px, shift_px, moved2, passing2, windowed)
 
 
 @kernel
@@ -244,8 +238,8 @@ def _motion_variance(history, block, row, own2, weight):
         for other in range(block - 1, block + 2):
             compared += polarities.columns[other] > 0.0
         apart = min(apart, abs(_near_sum(polarities.row, block)) / max(compared, 1))
-    off2, shift_px = history.common_px**2 + apart * apart, history.shift_px[block]
-    return min(max(moved2, 0.0), off2) + shift_px * shift_px
+    shift_px = history.shift_px[block]
+    return min(max(moved2, 0.0), apart * apart) + shift_px * shift_px
 
 
 @kernel(_nrt=False)
@@ -287,7 +281,7 @@ def _compare_with_recent(history, known, usual, width_variance):
     alike = _move_alike(now, recent)
     for block in range(1, now.points.size - 1):
         points = _near_sum(now.points, block)
-        history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
+        history.moved2[block], history.passing2[block] = 0.0, 0.0
         history.step_px[block] = 0.0
         if points == 0.0 or not history.windowed:
             continue

@@ -29,7 +29,7 @@ SIGMA_FLOOR_PX = 0.25
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
-BACKGROUND_FACTORS = {"mean": 1.35, "median": 2.2}
+BACKGROUND_FACTORS = {"mean": 1.5, "median": 2.7}
 """The factor b of each method that uses full columns."""
 
 

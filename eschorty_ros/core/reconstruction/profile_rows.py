@@ -226,7 +226,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         ),
         widths=empty_widths(shape),
         two_lines=empty_successive(),
-        history=empty_history(model.columns, settings.sigma_common_px, windowed),
+        history=empty_history(model.columns, windowed),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
         delay=record("time_us", "points"),

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.line import CENTROIDS, RETURNS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX, check_method
+from eschorty_ros.core.line import CENTROIDS, RETURNS, SIGMA_FLOOR_PX, check_method
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US
 from eschorty_ros.core.reconstruction.profile_length import periods_max
@@ -157,11 +157,6 @@ class Settings:
         SIGMA_FLOOR_PX, 0.01, 10.0, "px",
         "part of a row's standard deviation that more events do not reduce; scaled as with "
         "sigma_factor",
-    )  # fmt: skip
-    sigma_common_px: float = _number(
-        SIGMA_COMMON_PX, 0.0, 10.0, "px",
-        "part of a row's standard deviation that the columns of a moving line share, as pixels "
-        "remember where it was; more where rows of ON and OFF events disagree",
     )  # fmt: skip
     detail: str = _choice(
         "auto", ("auto", "off"),

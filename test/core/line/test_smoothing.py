@@ -8,7 +8,6 @@ from reconstructing import reconstruct
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.reconstruction import Settings
 
-COMMON_PX = 0.2
 # Too few columns for their scatter to set sigma.
 COLUMN = np.arange(1280.0)
 FEW = 16
@@ -21,7 +20,7 @@ def smoothed(row, half_width=2):
     y = np.floor(row[x] + np.tile([0.0, 0.25, 0.5, 0.75], lit.size)).astype(int)
     events = sort_readout(np.full(x.size, 2000), x, y, np.ones(x.size, np.uint8))
     found, _ = reconstruct(encoded(events), settings=Settings(
-        smoothing_half_width=half_width, sigma_common_px=COMMON_PX, isolation_events=0,
+        smoothing_half_width=half_width, isolation_events=0,
     ))  # fmt: skip
     out, sigma = np.full((2, row.size), np.nan)
     out[found.column], sigma[found.column] = found.row, found.sigma_row
@@ -94,7 +93,7 @@ def test_the_columns_own_variance_averages_out_and_the_shared_one_stays(half_wid
     np.testing.assert_array_equal(out, row)
     expected = np.sqrt(alone2 - own2 + own2 / (2 * half_width + 1))
     assert sigma[8] == pytest.approx(expected, rel=1e-12)
-    assert alone2 - own2 > COMMON_PX**2
+    assert alone2 - own2 > 0.0
 
 
 @pytest.mark.parametrize("scatter_px", [0.3, 0.6])
@@ -103,8 +102,7 @@ def test_sigma_is_the_scatter_of_the_columns(scatter_px):
     quarters = np.rint(rng.normal(0.0, 4 * scatter_px, 1280))
     row = 300 + 0.25 * quarters
     _, sigma = smoothed(row, half_width=0)
-    inner = np.sqrt(sigma[100:-100] ** 2 - COMMON_PX**2)
-    assert np.sqrt(np.mean(inner**2)) == pytest.approx(row.std(), rel=0.1)
+    assert np.sqrt(np.mean(sigma[100:-100] ** 2)) == pytest.approx(row.std(), rel=0.1)
 
 
 @pytest.mark.parametrize(("together", "least"), [(3, 0.9), (6, 0.8), (12, 0.8)])
@@ -114,7 +112,7 @@ def test_sigma_has_what_near_columns_share(together, least):
     out, sigma = smoothed(row)
     inner = slice(100, -100)
     scatter_px = np.sqrt(np.mean((out[inner] - 300.0) ** 2))
-    sigma_px = np.sqrt(np.mean(sigma[inner] ** 2 - COMMON_PX**2))
+    sigma_px = np.sqrt(np.mean(sigma[inner] ** 2))
     assert least < sigma_px / scatter_px < 1.1, "seed 8"
 
 
@@ -145,7 +143,7 @@ def test_a_step_is_no_scatter_of_the_columns_beside(step_px):
 def test_rows_that_do_not_scatter_have_the_sigma_of_whole_pixels():
     """A column's own variance, reduced by smoothing, is never taken as less than a 64th."""
     _, sigma = smoothed(np.full(400, 300.0))
-    np.testing.assert_allclose(sigma[60:-60] ** 2, COMMON_PX**2 + 1 / 12, rtol=1e-3)
+    np.testing.assert_allclose(sigma[60:-60] ** 2, 1 / 12, rtol=1e-3)
 
 
 @pytest.mark.parametrize("slope", [0.004, 0.02, 0.05])

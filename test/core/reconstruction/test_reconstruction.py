@@ -11,7 +11,7 @@ from reconstructing import CALIBRATION, KNOWN, assert_same, reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
-from eschorty_ros.core.line import SIGMA_COMMON_PX, SIGMA_FLOOR_PX
+from eschorty_ros.core.line import SIGMA_FLOOR_PX
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import (
     Profiles,
@@ -295,7 +295,7 @@ def test_one_event_and_constant_columns():
     found, _ = reconstruct(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
-    expected = np.sqrt(1 / 12 + SIGMA_FLOOR_PX**2 + SIGMA_COMMON_PX**2)
+    expected = np.sqrt(1 / 12 + SIGMA_FLOOR_PX**2)
     np.testing.assert_allclose(found.sigma_row, expected)
     assert found.t_us.tolist() == [2000, 3010]
 
