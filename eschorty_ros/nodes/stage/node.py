@@ -62,6 +62,7 @@ class StageNode(DeviceNode):
         self._lock = threading.RLock()
         self._busy = threading.Lock()
         self._stage: LinearStage | None = None
+        self._stops = 0
         super().__init__("stage", TABLE, **kwargs)
         self._frames = frames(self.parameters["frame_prefix"])
         self.moves = 0
@@ -121,6 +122,7 @@ class StageNode(DeviceNode):
     def stop_device(self) -> None:
         """Begin a profiled stop."""
         with self._lock:
+            self._stops += 1
             if self._stage is not None:
                 self._stage.stop()
 
@@ -178,7 +180,7 @@ class StageNode(DeviceNode):
         return self._result(True, "arrived", state)
 
     def _begin(self, target_mm: float, speed_mm_s: float) -> None:
-        stage = self._opened()
+        stage, stops = self._opened(), self._stops
         if not self.active:
             raise DeviceError(f"stage refused: node is {self.state_label}; activate it first")
         low_mm, high_mm = stage.travel_mm
@@ -193,6 +195,9 @@ class StageNode(DeviceNode):
                 f"{m_from_mm(SPEED_MIN_MM_S):g} to {m_from_mm(stage.speed_max_mm_s):g} m/s"
             )
         stage.move_to(target_mm, speed_mm_s)
+        if stops != self._stops:
+            # The node was deactivated since, perhaps before the stage took the order.
+            stage.stop()
         self.moves += 1
         self._begun.set()
 

@@ -13,33 +13,28 @@ from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger, StageLimits
 from nav_msgs.msg import Odometry
-from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
+from rclpy.lifecycle import TransitionCallbackReturn
+from ros_process import NodeProcess, Observer, nodes_here, ros_minus_steady_ns, wait_until
 
 from eschorty_ros.emulation.bench.devices import Bench
+from eschorty_ros.hardware.stage.apt_stage import AptStage
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.stage.node import StageNode
 
 # To the far end it takes longer than any wait of these tests.
 SLOW_M_S = 0.01
 
 
-class Stage:
-    """A stage node and a client of it, which ``stack`` ends."""
+class Client:
+    """A client of ``stage/move``."""
 
-    def __init__(
-        self, stack: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
-    ) -> None:
-        self.emulated = emulated
-        self.process = stack.enter_context(
-            NodeProcess("eschorty_ros.nodes.stage.node", {"bench": folder}, domain=observer.domain)
-        )
-        self.odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
-        self.observer = observer
+    def __init__(self, observer: Observer) -> None:
         self._client = observer.action_client(MoveStage, "stage/move")
-        stack.callback(self._client.destroy)
-        observer.wait_for_state("stage", "active")
         wait_until(self._client.server_is_ready, "stage/move")
-        wait_until(lambda: self.odometry, "odometry")
+
+    def close(self) -> None:
+        self._client.destroy()
 
     def start(self, position: float, speed: float) -> Any:
         """Goal handle of a move, m and m/s."""
@@ -58,6 +53,24 @@ class Stage:
 
     def move(self, position: float, speed: float) -> Any:
         return self.finish(self.start(position, speed))
+
+
+class Stage(Client):
+    """A stage node and a client of it, which ``stack`` ends."""
+
+    def __init__(
+        self, stack: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
+    ) -> None:
+        self.emulated = emulated
+        self.process = stack.enter_context(
+            NodeProcess("eschorty_ros.nodes.stage.node", {"bench": folder}, domain=observer.domain)
+        )
+        self.odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
+        self.observer = observer
+        observer.wait_for_state("stage", "active")
+        super().__init__(observer)
+        stack.callback(self.close)
+        wait_until(lambda: self.odometry, "odometry")
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +169,26 @@ def test_deactivate_stops_a_move(stage: Stage) -> None:
     assert "stopped at" in outcome.result.message
     assert "inactive" in stage.move(0.1, 0.1).result.message
     assert stage.observer.change_state("stage", "activate")
+
+
+def test_deactivate_just_before_a_move_begins_stops_it(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move_to = AptStage.move_to
+    with bench_here() as (_, folder), nodes_here(observer.domain, 4) as start:
+        node = start(StageNode, bench=str(folder))
+
+        def deactivated(stage: AptStage, position_mm: float, speed_mm_s: float) -> None:
+            assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+            move_to(stage, position_mm, speed_mm_s)
+
+        monkeypatch.setattr(AptStage, "move_to", deactivated)
+        wait_until(lambda: node.active, "the node active")
+        with contextlib.closing(Client(observer)) as client:
+            outcome = client.move(0.2, SLOW_M_S)
+    assert outcome.status == GoalStatus.STATUS_ABORTED
+    assert "stopped at" in outcome.result.message
+    assert outcome.result.position < 0.01
 
 
 def test_a_refused_command_is_one_warning(stage: Stage) -> None:
