@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,8 @@ class ActiveCalibration:
         self._node = node
         self._paths = paths
         self._use = use
+        # The one in use is the one published, also when a fit ends while another is loaded.
+        self._exchanging = threading.Lock()
         self._publisher = node.create_publisher(
             ActiveCalibrationMessage, "reconstruction/calibration", qos.latched()
         )
@@ -78,9 +81,10 @@ class ActiveCalibration:
         return str(path)
 
     def _exchange(self, calibration: Calibration, file: str) -> None:
-        self._use(calibration)
-        self.calibration = calibration
-        self._publish(file)
+        with self._exchanging:
+            self._use(calibration)
+            self.calibration = calibration
+            self._publish(file)
         self._node.get_logger().info(f"calibration {calibration.id or calibration.name}: {file}")
 
     def _publish(self, file: str) -> None:
