@@ -6,12 +6,16 @@ import threading
 import time
 from collections.abc import Callable
 
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import CHECK_S, HeartbeatSchedule
 from eschorty_ros.hardware.base.stalls import StallMeter
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.spin import ends
+
+_LOG_S = 1.0
 
 
 class Heartbeat:
@@ -82,10 +86,16 @@ class Heartbeat:
             return False
 
     def _publish(self, text: str) -> bool:
-        message = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=text)
+        """Publish, log a failure; return whether the node still exists."""
         try:
-            self._publisher.publish(message)
-        except Exception:
-            # A signal may end the context, or the node be destroyed, in between.
+            stamp = self._node.get_clock().now().to_msg()
+            self._publisher.publish(Header(stamp=stamp, frame_id=text))
+        except _rclpy.InvalidHandle:
             return False
+        except Exception as error:
+            # A signal may end the context in between.
+            if not ends(self._node):
+                self._node.get_logger().error(
+                    f"{self._topic} not sent: {error!r}", throttle_duration_sec=_LOG_S
+                )
         return True
