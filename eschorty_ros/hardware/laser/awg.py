@@ -304,15 +304,20 @@ class AwgLaser:
         link = _open_link(self._settings, self._profile, self._link_serial)
         self._link_serial = link.serial
         self._counters["openings"] += 1
-        self._open_channel = AwgChannel(
-            link,
-            self._settings,
-            self._profile,
-            self._refuse_void,
-            self._renew_if_requested,
-            self._warn,
-            self._counters,
-        )
+        try:
+            self._open_channel = AwgChannel(
+                link,
+                self._settings,
+                self._profile,
+                self._refuse_void,
+                self._renew_if_requested,
+                self._warn,
+                self._counters,
+            )
+        except BaseException:
+            # A level of the profile may lie outside its own bounds.
+            link.close()
+            raise
 
     def _drop(self) -> None:
         """Release the generator; idempotent, never raises."""

@@ -270,6 +270,20 @@ def test_bad_settings_are_one_line(changes: dict[str, Any], text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_profile_whose_dark_level_is_out_of_bounds_leaves_the_generator_free(
+    bench: AwgBench, tmp_path: Path
+) -> None:
+    text = (ROOT / "config" / "awg_utg900e.yaml").read_text()
+    profile = tmp_path / "awg_wrong.yaml"
+    text = text.replace("dark_high_v: 0.01", "dark_high_v: 20.0")
+    profile.write_text(text.replace("dark_limit_v: 0.1", "dark_limit_v: 20.0"))
+    with pytest.raises(ArgumentError, match="high is 20; the generator takes -10 to 10") as kept:
+        bench.laser(profile=str(profile))
+    # The error keeps what raised it, which would release the generator when it is collected.
+    assert kept.value.__traceback__
+    bench.laser().close()
+
+
 def test_channel_beyond_the_generator_is_refused(bench: AwgBench) -> None:
     with pytest.raises(ArgumentError, match="channel is 3; the generator has 2"):
         bench.laser(channel=3)
