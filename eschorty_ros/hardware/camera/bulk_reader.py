@@ -36,8 +36,8 @@ _NAME = "camera: reading events"
 
 ClockNs = Callable[[], int]
 
-_LEAKED: list[Any] = []
-"""Transfers that libusb did not give back."""
+# Each with its buffer and callback, which libusb may still use.
+_LOST: list[Any] = []
 
 
 class BulkReader(Protocol):
@@ -97,6 +97,11 @@ class SyncReader:
 
     def stop(self) -> None:
         """Do nothing: no transfer is pending between two reads."""
+
+
+def lost_transfers() -> int:
+    """Return the transfers of this process that libusb did not give back in time, 128 kB each."""
+    return len(_LOST)
 
 
 def drain(device: usb.core.Device, endpoint: int, buffer: array.array[int]) -> None:
@@ -170,7 +175,8 @@ class AsyncReader:
         self._received: deque[tuple[bytes, int]] = deque()
         self._failure: DeviceError | None = None
         self._stopping = True
-        self._pending = 0
+        # Addresses; one that was given up is none of them.
+        self._pending: set[int] = set()
         self._transfers: list[Any] = []
         self._buffers: list[Any] = []
         self._on_completed = library.libusb_transfer_cb_fn_p(self._completed)
@@ -199,7 +205,7 @@ class AsyncReader:
         return b"", self._clock_ns()
 
     def stop(self) -> None:
-        """Cancel what is queued and wait for it, at most 1 s."""
+        """Cancel what is queued and wait for it, at most 1 s; see ``lost_transfers``."""
         self._stopping = True
         for transfer in self._transfers:
             # libusb refuses to cancel a completed transfer, without further effect.
@@ -208,13 +214,13 @@ class AsyncReader:
             if not self._pending:
                 break
             self._handle_events(_CANCEL_WAIT_S)
-        if self._pending:
-            # libusb still owns them: 2.5 MB are leaked, because freeing them would crash.
-            _LEAKED.append((self._transfers, self._buffers, self._on_completed))
-        else:
-            for transfer in self._transfers:
+        for transfer, buffer in zip(self._transfers, self._buffers, strict=True):
+            if _address(transfer) in self._pending:
+                # libusb still owns it: freeing it would crash.
+                _LOST.append((transfer, buffer, self._on_completed))
+            else:
                 self._library.libusb_free_transfer(transfer)
-        self._transfers, self._buffers, self._pending = [], [], 0
+        self._transfers, self._buffers, self._pending = [], [], set()
 
     def _queue_all(self) -> None:
         library = self._library
@@ -237,18 +243,20 @@ class AsyncReader:
                 None,
                 _TRANSFER_TIMEOUT_MS,
             )
-            self._pending += 1
+            self._pending.add(_address(transfer))
             self._submit(transfer)
 
     def _submit(self, transfer: Any) -> None:
         code = self._library.libusb_submit_transfer(transfer)
         if code:
-            self._pending -= 1
+            self._pending.discard(_address(transfer))
             gone = code == self._library.LIBUSB_ERROR_NO_DEVICE
             self._fail(DeviceGoneError if gone else DeviceError, f"not queued (libusb {code})")
 
     def _completed(self, transfer: Any) -> None:
         """Collect a finished transfer; runs in the thread that handles libusb's events."""
+        if _address(transfer) not in self._pending:
+            return
         library, done = self._library, transfer.contents
         status = done.status
         # Data after a failed transfer follows a gap that is not marked yet.
@@ -259,7 +267,7 @@ class AsyncReader:
         if finished and not self._stopping and self._failure is None:
             self._submit(transfer)
             return
-        self._pending -= 1
+        self._pending.discard(_address(transfer))
         if status == library.LIBUSB_TRANSFER_STALL:
             self._fail(DeviceStallError, "the endpoint is halted")
         elif status == library.LIBUSB_TRANSFER_NO_DEVICE:
@@ -277,3 +285,7 @@ class AsyncReader:
         code = library.libusb_handle_events_timeout(self._context, ctypes.byref(wait))
         if code and code != library.LIBUSB_ERROR_INTERRUPTED:
             self._fail(DeviceError, f"libusb error {code} while handling events")
+
+
+def _address(transfer: Any) -> int:
+    return ctypes.addressof(transfer.contents)

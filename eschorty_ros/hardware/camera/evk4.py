@@ -15,7 +15,7 @@ import usb.backend
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, EschortyError
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, EventChunk
-from eschorty_ros.hardware.camera.bulk_reader import ClockNs
+from eschorty_ros.hardware.camera.bulk_reader import ClockNs, lost_transfers
 from eschorty_ros.hardware.camera.camera_usb import NAME
 from eschorty_ros.hardware.camera.chunk_queue import BYTES_MAX, ChunkQueue
 from eschorty_ros.hardware.camera.connection import Connection, EndedError
@@ -234,6 +234,7 @@ class Evk4:
             "gaps": queue.gaps,
             "restarts": queue.restarts,
             "failed_transfers": self._failed_transfers,
+            "lost_transfers": lost_transfers(),
             "losses": connection.losses,
             "reconnects": connection.reconnects,
             "reconnect_attempts": connection.attempts,

@@ -15,6 +15,7 @@ from eschorty_ros.hardware.camera.bulk_reader import (
     TRANSFERS,
     AsyncReader,
     SyncReader,
+    lost_transfers,
     make_reader,
 )
 
@@ -40,6 +41,8 @@ class Bus:
         self.freed = 0
         self.events: list[tuple[int, bytes]] = []
         self.submit_code = 0
+        self.stuck = 0
+        """Transfers that cancelling does not end."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(libusb1, name)
@@ -52,6 +55,9 @@ class Bus:
     def libusb_cancel_transfer(self, transfer: Any) -> int:
         for index, queued in enumerate(self.queued):
             if address(queued) == address(transfer):
+                if self.stuck:
+                    self.stuck -= 1
+                    return 0
                 self.queued.insert(0, self.queued.pop(index))
                 self.events.insert(0, (libusb1.LIBUSB_TRANSFER_CANCELLED, b""))
                 return 0
@@ -144,6 +150,24 @@ def test_failed_transfer_comes_after_what_was_received(
     assert reader.read(0.1)[0] == b"efgh"
     reader.stop()
     assert bus.freed == 2 * TRANSFERS
+
+
+def test_transfer_that_returns_after_the_wait_for_it_does_not_count_in_the_next_stream(
+    bus: Bus, reader: AsyncReader
+) -> None:
+    lost = lost_transfers()
+    reader.start()
+    bus.stuck = 1
+    reader.stop()
+    assert lost_transfers() == lost + 1
+    assert (len(bus.queued), bus.freed) == (1, TRANSFERS - 1)
+    reader.start()
+    bus.events = [(COMPLETED, b"late"), (COMPLETED, b"abcd")]
+    assert reader.read(0.1)[0] == b"abcd"
+    assert reader.read(0.1)[0] == b""
+    assert len(bus.queued) == TRANSFERS
+    reader.stop()
+    assert (bus.queued, bus.freed) == ([], 2 * TRANSFERS - 1)
 
 
 def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus, reader: AsyncReader) -> None:
