@@ -204,8 +204,7 @@ class AptLink:
                 timer.action()
         while self._queue:
             self.write(self._queue.popleft())
-        due_ns = min((timer.due_ns for timer in self._timers), default=now_ns + 10**9)
-        return max(due_ns - self.now_ns(), 0) * 1e-9
+        return self._idle_s()
 
     def close(self) -> None:
         """End the threads and release the port; idempotent."""
@@ -260,7 +259,13 @@ class AptLink:
 
     def _write_loop(self) -> None:
         while not self._closing.is_set() and self._lost is None:
-            idle_s = self.service()
+            self.service()
             with self._queued:
-                if not self._queue and not self._closing.is_set():
-                    self._queued.wait(idle_s)
+                # What was added since wakes a writer that waits, and this one does not yet.
+                if not self._queue and not self._closing.is_set() and self._lost is None:
+                    self._queued.wait(self._idle_s())
+
+    def _idle_s(self) -> float:
+        now_ns = self.now_ns()
+        due_ns = min((timer.due_ns for timer in self._timers), default=now_ns + 10**9)
+        return max(due_ns - now_ns, 0) * 1e-9
