@@ -267,7 +267,11 @@ class LaserSupervisor:
         while self._outbox and self._sending.acquire(blocking=False):
             try:
                 while self._outbox:
-                    self._outbox.popleft()()
+                    try:
+                        self._outbox.popleft()()
+                    except Exception as error:
+                        # It must end neither a watchdog nor a command.
+                        self._log(f"laser: its state was not published: {error!r}")
             finally:
                 self._sending.release()
 

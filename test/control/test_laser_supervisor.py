@@ -355,6 +355,25 @@ def test_a_publisher_that_never_returns_does_not_keep_light_on(laser):
     supervisor.close()
 
 
+def test_a_status_that_cannot_be_published_ends_no_watchdog(laser):
+    def publish(status: LaserStatus) -> None:
+        if threading.current_thread().name == "laser watchdog":
+            raise RuntimeError("no buffer")
+
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}, contact_timeout_s=60.0)
+    supervisor = opened(laser, interlock, publish)
+    for _ in range(2):
+        interlock.receive_contact(False)
+        interlock.reset_contact([])
+        supervisor.arm()
+        supervisor.enable()
+        assert laser.lit
+        interlock.receive_contact(True)
+        wait_until(lambda: supervisor.status().requested is LaserOutput.OFF, "the trip")
+        assert not laser.lit
+    supervisor.close()
+
+
 def test_the_watchdog_of_a_laser_that_is_lit_runs_no_callback_of_another_thread(laser):
     begun: list[str] = []
 
