@@ -143,21 +143,31 @@ class LaserSupervisor:
                 raise
             self._receive(readback)
 
-    def arm(self) -> None:
-        """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
+    def ticket(self) -> int:
+        """Return the ticket of a command that is requested now, which disabling voids."""
+        return self._in_flight.ticket()
+
+    def arm(self, ticket: int | None = None) -> None:
+        """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be.
+
+        - ``ticket``: That of the request; taken now when omitted.
+        """
         fault = self.interlock.contact_fault()
         if fault:
             raise DeviceError(f"laser refused: {fault}")
-        with self._command() as (laser, ticket):
+        with self._command(ticket) as (laser, ticket):
             laser.arm()
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 self.interlock.arm()
                 self._record.reason, self._trip_reason = "armed", ""
 
-    def enable(self) -> None:
-        """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
-        with self._command() as (laser, ticket):
+    def enable(self, ticket: int | None = None) -> None:
+        """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails.
+
+        - ``ticket``: As for ``arm``.
+        """
+        with self._command(ticket) as (laser, ticket):
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 if self._record.requested is LaserOutput.ON:
@@ -280,9 +290,9 @@ class LaserSupervisor:
             self._later(partial(callback, text))
 
     @contextlib.contextmanager
-    def _command(self) -> Iterator[tuple[LaserModulator, int]]:
+    def _command(self, ticket: int | None = None) -> Iterator[tuple[LaserModulator, int]]:
         """Wait for a turn; gives the laser and the command's ticket."""
-        ticket = self._in_flight.ticket()
+        ticket = self.ticket() if ticket is None else ticket
         with self._commands:
             with self._locked():
                 laser = self._laser

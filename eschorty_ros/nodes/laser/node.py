@@ -205,13 +205,13 @@ class LaserNode(DeviceNode):
             return False, str(error)
 
     def _arm(self) -> str:
-        with self._accepted():
-            self._supervisor.arm()
+        with self._accepted() as ticket:
+            self._supervisor.arm(ticket)
         return "armed"
 
     def _enable(self) -> str:
-        with self._accepted():
-            self._supervisor.enable()
+        with self._accepted() as ticket:
+            self._supervisor.enable(ticket)
         return "switched on by request"
 
     def _disable(self) -> str:
@@ -224,7 +224,9 @@ class LaserNode(DeviceNode):
         return reason
 
     @contextlib.contextmanager
-    def _accepted(self) -> Iterator[None]:
+    def _accepted(self) -> Iterator[int]:
+        # Before the state is looked at: leaving it disables, which voids the ticket.
+        ticket = self._supervisor.ticket()
         if not self.active:
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
         if not self._commands.acquire(blocking=False):
@@ -232,7 +234,7 @@ class LaserNode(DeviceNode):
                 f"laser refused: {_COMMANDS_MAX} commands are under way; wait for their answers"
             )
         try:
-            yield
+            yield ticket
         finally:
             self._commands.release()
 

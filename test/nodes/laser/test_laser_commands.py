@@ -12,6 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 from waiting import DEADLINE_S
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
+from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.nodes.laser.node import THREADS, LaserNode
 from eschorty_ros.nodes.ros import drivers, qos
 
@@ -56,6 +57,21 @@ def test_commands_that_wait_leave_a_thread_for_disabling(
         laser.go.set()
         refusals = [answer.result().message for answer in waiting if not answer.result().success]
     assert any("commands are under way" in refusal for refusal in refusals)
+
+
+@pytest.mark.usefixtures("laser")
+def test_arming_that_crosses_a_deactivation_is_refused(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm = LaserSupervisor.arm
+
+    def arm_once_deactivated(supervisor: LaserSupervisor, *ticket: int) -> None:
+        assert observer.change_state("laser", "deactivate")
+        arm(supervisor, *ticket)
+
+    monkeypatch.setattr(LaserSupervisor, "arm", arm_once_deactivated)
+    answer = observer.call(Trigger, "laser/arm")
+    assert (answer.success, answer.message) == (False, "laser refused: not active")
 
 
 def test_interlock_that_is_reported_open_repeatedly_switches_off_once(
