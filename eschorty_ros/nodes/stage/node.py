@@ -166,7 +166,11 @@ class StageNode(DeviceNode):
     def _move_to_goal(self, goal: Any) -> MoveStage.Result:
         target_mm, speed_mm_s = mm_from_m(goal.request.position), mm_from_m(goal.request.speed)
         self._begin(target_mm, speed_mm_s)
-        state = self._follow(goal)
+        try:
+            state = self._follow(goal)
+        except BaseException:
+            self.stop_device()
+            raise
         if goal.is_cancel_requested:
             with unless_shut_down(self):
                 goal.canceled()
@@ -214,7 +218,6 @@ class StageNode(DeviceNode):
                 stage.stop()
                 stopping = True
             if ends(self):
-                stage.stop()
                 raise DeviceError(_INTERRUPTED)
             if time.monotonic() - feedback_s >= _FEEDBACK_PERIOD_S:
                 feedback_s = time.monotonic()

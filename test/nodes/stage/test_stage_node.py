@@ -1,6 +1,7 @@
 """The stage node as a process at an emulated bench: odometry, moves and their refusals."""
 
 import contextlib
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger, StageLimits
 from nav_msgs.msg import Odometry
+from rclpy.action.server import ServerGoalHandle
 from rclpy.lifecycle import TransitionCallbackReturn
 from ros_process import NodeProcess, Observer, nodes_here, ros_minus_steady_ns, wait_until
 
@@ -189,6 +191,23 @@ def test_deactivate_just_before_a_move_begins_stops_it(
     assert outcome.status == GoalStatus.STATUS_ABORTED
     assert "stopped at" in outcome.result.message
     assert outcome.result.position < 0.01
+
+
+def test_a_move_that_cannot_be_followed_is_stopped(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def publish_feedback(*_: Any) -> None:
+        raise RuntimeError("no buffer")
+
+    monkeypatch.setattr(ServerGoalHandle, "publish_feedback", publish_feedback)
+    with bench_here() as (emulated, folder), nodes_here(observer.domain, 4) as start:
+        node = start(StageNode, bench=str(folder))
+        wait_until(lambda: node.active, "the node active")
+        with contextlib.closing(Client(observer)) as client:
+            assert client.move(0.2, SLOW_M_S).status == GoalStatus.STATUS_ABORTED
+        axis = emulated.stage.axis
+        wait_until(lambda: not axis.moving(time.monotonic_ns()), "rest")
+        assert axis.position_mm(time.monotonic_ns()) < 10.0
 
 
 def test_a_refused_command_is_one_warning(stage: Stage) -> None:
