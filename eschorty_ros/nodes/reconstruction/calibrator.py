@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
@@ -47,8 +48,8 @@ class Calibrator:
     the reason to the client.
 
     - ``node``: The reconstruction node.
-    - ``in_worker``: Runs a job in the reconstruction's worker; returns success and the reason of a
-      failure.
+    - ``in_worker``: Runs a job in the reconstruction's worker within a time, or with 0 at any later
+      time; returns success and the reason of a failure.
     - ``set_capture``: Sets the capture to feed, or ``None``; called in the worker. Raises an
       ``EschortyError`` when that is refused.
     - ``line_width_px``: Returns the width of the line in the node's settings.
@@ -166,8 +167,12 @@ class Calibrator:
         return Calibrate.Result(success=False, message=reason)
 
     def _feed(self, capture: Capture | None) -> None:
-        done, reason = self._in_worker(lambda: self._set_capture(capture), _WORKER_TIMEOUT_S)
+        feed = partial(self._set_capture, capture)
+        done, reason = self._in_worker(feed, _WORKER_TIMEOUT_S)
         if not done:
+            if capture is None:
+                # Until the capture has ended no scan can begin.
+                self._in_worker(feed, 0.0)
             raise DeviceError(f"reconstruction: {reason}")
 
 
