@@ -41,13 +41,13 @@ RAW_ALONE = (
 )
 """What to do with a file that is no recording."""
 
-_REMEDIES = {
-    EVENTS_FILE: "the camera's .raw",
-    STAGE_FILE: "es.write_stage_csv",
-    LASER_FILE: "es.write_laser_yaml; reconstruct --frequency stands in",
-    CALIBRATION_FILE: "es.save_calibration; reconstruct --calibration stands in",
+_NEEDED = {
+    EVENTS_FILE: "",
+    STAGE_FILE: "",
+    LASER_FILE: " (or reconstruct --frequency)",
+    CALIBRATION_FILE: " (or reconstruct --calibration)",
 }
-"""What adds each file that a recording needs."""
+"""The files that a recording needs, and what stands in for one."""
 
 STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
 TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
@@ -234,10 +234,10 @@ def load_recording(
 def _check_files(folder: Path, replaced: set[str]) -> None:
     """Refuse a folder that lacks files, all of them named; those ``replaced`` may be missing."""
     missing = []
-    for name, remedy in _REMEDIES.items():
+    for name, instead in _NEEDED.items():
         if name not in replaced and not (folder / name).is_file():
             packed = (folder / f"{name}.gz").is_file()
-            missing.append(f"{name} ({f'run gunzip on {name}.gz' if packed else remedy})")
+            missing.append(name + (f" (run gunzip on {name}.gz)" if packed else instead))
     if missing:
         raise FormatError(
             f"{folder}: missing from the recording {'is' if len(missing) == 1 else 'are'} "

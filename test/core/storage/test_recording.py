@@ -59,6 +59,16 @@ def test_given_values_stand_in_for_missing_files(folder):
         load_recording(folder)
 
 
+def test_every_missing_file_is_named_beside_a_long_path(tmp_path):
+    (tmp_path / "the_first_scan_of_the_day").mkdir()
+    with pytest.raises(FormatError) as caught:
+        load_recording(tmp_path / "the_first_scan_of_the_day")
+    assert str(caught.value).endswith(
+        "events.raw, stage.csv, laser.yaml (or reconstruct --frequency), calibration.yaml (or "
+        "reconstruct --calibration); docs/python.md shows how to add them"
+    )
+
+
 def test_layout_of_the_written_files(folder):
     assert (folder / "stage.csv").read_text() == (
         "t_us,position_mm\n0,0.000000\n1000,0.050000\n3000,0.150000\n"
@@ -160,12 +170,12 @@ def test_faults_survive_the_way_from_another_process():
             ["scan.yaml", "stage_gap_s is 1e+305"],
         ),
         (edit("scan.yaml", SCAN + "stage_gap_s: -5\n"), ["scan.yaml", "stage_gap_s is -5"]),
-        (remove("events.raw"), ["is events.raw (the camera's .raw)", "docs/python.md"]),
+        (remove("events.raw"), ["is events.raw; docs/python.md"]),
         (
             lambda folder: [(folder / f"{n}").unlink() for n in ("stage.csv", "laser.yaml")],
-            ["are stage.csv (es.write_stage_csv), laser.yaml (es.write_laser_yaml", "--frequency"],
+            ["are stage.csv, laser.yaml (or reconstruct --frequency);"],
         ),
-        (remove("calibration.yaml"), ["calibration.yaml (es.save_calibration", "--calibration"]),
+        (remove("calibration.yaml"), ["is calibration.yaml (or reconstruct --calibration)"]),
         (edit("stage.csv", "time,pos\n0,1\n"), ["line 1", "time,pos", "t_us,position_mm"]),
         (edit("stage.csv", "\n"), ["stage.csv line 1", "t_us,position_mm"]),
         (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "samples: 0", "two or more"]),
