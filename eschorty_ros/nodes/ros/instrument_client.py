@@ -252,6 +252,7 @@ class InstrumentClient(PacedWaiting):
             # The heartbeats of a camera and a stage that have just started come soon.
             if _HEARTBEAT not in refusal or time.monotonic() > ends_s:
                 raise ScanFailure(f"laser: {refusal}")
+            self.waits_for = f"laser: {refusal}"
             again_s = time.monotonic() + _ENABLE_AGAIN_S
             while time.monotonic() < again_s:
                 self.tick()

@@ -7,6 +7,7 @@ import pytest
 from eschorty_ros.control.instrument_monitor import InstrumentMonitor
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure, ScanRequest
+from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.nodes.ros.instrument_client import ScanClient
 
 
@@ -61,3 +62,15 @@ def test_a_scan_that_is_refused_begins_later_if_the_reason_may_pass(retry):
     else:
         with pytest.raises(ScanFailure, match="has 2 publishers"):
             client.begin_scan(request)
+
+
+def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
+    reason = "laser refused: camera/heartbeat reports stopped; look at the camera node"
+    client, refusals, waits = CanceledClient(canceled=False), [reason, reason, ""], []
+    client._heartbeat = SimpleNamespace(begin=lambda: None, healthy=True)
+    client._arm_and_enable = lambda: refusals.pop(0)
+    client.monitor.laser = SimpleNamespace(output=LaserOutput.ON)
+    client._feedback = lambda phase: waits.append(client.waits_for)
+    client.laser_on()
+    assert set(waits) == {"", f"laser: {reason}"}
+    assert client.waits_for == ""
