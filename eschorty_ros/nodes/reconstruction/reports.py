@@ -100,8 +100,9 @@ class Reports:
         if not stream.packets:
             late = time.monotonic() > self._begun_s + PACKETS_EXPECTED_S
             if late:
+                topic = self._node.resolve_topic_name("camera/events")
                 self._node.get_logger().warning(
-                    "no packets on camera/events yet; check the camera's node and the topic",
+                    f"no packets on {topic} yet; check the camera's node and the topic",
                     throttle_duration_sec=_REMINDER_S,
                 )
             return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values

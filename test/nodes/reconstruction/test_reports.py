@@ -58,13 +58,17 @@ def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
     logged = []
     logger = SimpleNamespace(warning=lambda line, **_: logged.append(line))
-    node = SimpleNamespace(create_publisher=lambda *_: None, get_logger=lambda: logger)
+    node = SimpleNamespace(
+        create_publisher=lambda *_: None,
+        get_logger=lambda: logger,
+        resolve_topic_name=lambda _: "/driver/events",
+    )
     reports = Reports(node, pipeline, JobQueue(1))
     assert reports.diagnose()[:2] == (diagnostics.OK, "no packets yet")
     assert not logged
     monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.0)
     assert reports.diagnose()[:2] == (diagnostics.WARN, "no packets yet")
-    assert "no packets on camera/events" in logged[0]
+    assert "no packets on /driver/events yet" in logged[0]
 
 
 @pytest.mark.parametrize("taken", [False, True])
