@@ -148,6 +148,11 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             print(sys.modules[getattr(factory, "func", factory).__module__].__doc__)
         print(_HELP.format(Path(sys.argv[0]).name))
         return 0
+    if words and words[0] != "--ros-args":
+        # ROS takes these for its old remap rules, or ignores them.
+        print(f"error: {words[0]!r} is unknown; names and parameters follow --ros-args",
+              file=sys.stderr)  # fmt: skip
+        return 1
     nodes: list[Node] = []
     second: SecondNodes | None = None
     spinning: Spinning | None = None

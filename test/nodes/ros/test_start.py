@@ -80,6 +80,13 @@ def test_help_says_how_names_and_parameters_are_given_and_starts_nothing(capsys)
     assert not rclpy.ok()
 
 
+@pytest.mark.parametrize("given", [["-p", "driver:=awg"], ["driver:=awg", "--ros-args"]])
+def test_words_before_ros_args_are_refused(capsys, given: list[str]) -> None:
+    assert run(ScannerNode, args=given) == 1
+    assert f"{given[0]!r} is unknown" in capsys.readouterr().err
+    assert not rclpy.ok()
+
+
 @pytest.mark.parametrize(
     ("arguments", "environment", "words"),
     [
