@@ -95,7 +95,7 @@ def main() -> None:
 
     A camera on a tilted sensor plane watches a modulated laser line while a stage carries it past
     the scene; every modulation period becomes one profile of 3D points. Ranges are along the
-    laser sheet. The command line takes millimetres, clouds hold metres.
+    laser sheet. Lengths are in mm unless an option has another unit; clouds hold metres.
 
     \b
     A recording is a folder:
