@@ -124,7 +124,6 @@ def command(
         load_viser()
         open_when_served(host, port)
         click.echo(f"page at {page_url(host, port)}", err=True)
-    report_replaced(out / "scan.pcd")
     with _made(out, record), ended_by_signals(), progress_bar("scanning") as feedback:
         out.mkdir(parents=True, exist_ok=True)
         check_writable(out / "scan.pcd")
@@ -180,6 +179,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
 
     if result.success or len(result.points):
         cloud = result.points if result.organized is None else result.organized
+        report_replaced(out / "scan.pcd")
         write_cloud(out / "scan.pcd", cloud)
     if not result.success or not len(result.points):
         kept = f" ({len(result.points):,} points kept in {out / 'scan.pcd'})"

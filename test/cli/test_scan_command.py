@@ -170,7 +170,11 @@ def test_what_a_scan_lost_is_printed(tmp_path, capsys):
     points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]
     lost = "7 points had no stage position"
     finish(request, ScanResult(True, lost, points, 4, 100, 0, 0, "complete", 1.0), tmp_path)
-    assert lost in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert lost in printed
+    assert "is replaced" not in printed
+    finish(request, ScanResult(True, lost, points, 4, 100, 0, 0, "complete", 1.0), tmp_path)
+    assert "scan.pcd of " in capsys.readouterr().err
 
 
 def test_a_recording_without_room_for_its_truth_is_a_warning_below_the_scan(tmp_path, capsys):
@@ -204,3 +208,7 @@ def test_a_scan_that_fails_leaves_no_empty_folders(tmp_path, monkeypatch):
     done = CliRunner().invoke(main, options)
     assert (done.exit_code, done.stderr.splitlines()[-1]) == (1, "eschorty: the camera is lost")
     assert list(tmp_path.iterdir()) == []
+    # An earlier cloud stays.
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "scan.pcd").write_bytes(b"")
+    assert "is replaced" not in CliRunner().invoke(main, options).stderr
