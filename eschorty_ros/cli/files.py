@@ -28,12 +28,15 @@ def is_yaml(path: Path) -> bool:
     return path.suffix.lower() in (".yaml", ".yml")
 
 
-def check_picture(out: Path, *inputs: Path) -> None:
-    """Refuse a picture that cannot be written, or whose extension names no form of one."""
+def check_picture(out: Path, *inputs: Path, others: str = "") -> None:
+    """Refuse a picture that cannot be written, or whose extension names no form of one.
+
+    - ``others``: Extensions that the command also writes, for the message.
+    """
     from matplotlib.backend_bases import FigureCanvasBase
 
     if out.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
-        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose .png, .pdf or .svg")
+        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose {others}.png, .pdf or .svg")
     check_output(out, *inputs)
 
 

@@ -191,7 +191,7 @@ def test_an_output_is_refused_before_a_cloud_is_read(monkeypatch, cloud, command
 
 def test_one_bad_output_of_a_design_is_refused_before_the_others_are_written(tmp_path):
     outs = ("--out", tmp_path / "a.yaml", "--out", tmp_path / "a.txt")
-    assert_fails_in_one_line(run("design", *outs), "choose .png, .pdf or .svg")
+    assert_fails_in_one_line(run("design", *outs), "choose .yaml, .png, .pdf or .svg")
     assert list(tmp_path.iterdir()) == []
 
 
