@@ -43,6 +43,7 @@ class StagePlacer:
         self.points_without_stage_of_scan = 0
         self.waiting = 0
         self._since_ns: int | None = None
+        self._lost_ns = 0
         self.track_restarts = 0
         self._late_before = 0
         self._sampled: tuple[int, float] | None = None
@@ -54,6 +55,14 @@ class StagePlacer:
     def late_samples(self) -> int:
         """Return the number of stage samples left out: not later than the one before."""
         return self._late_before + self.track.dropped
+
+    @property
+    def lost_why(self) -> str:
+        """Return where the newest stage sample is from the last points that were discarded."""
+        if self.track.last_us is None:
+            return "nothing has come on stage/odom"
+        apart_s = (self.track.last_us * NS_PER_US - self._lost_ns) * 1e-9
+        return f"the newest sample of stage/odom is {apart_s:+.3f} s from them"
 
     def set_gap(self, gap_s: float) -> None:
         """Change the longest time between two samples that is bridged."""
@@ -128,6 +137,8 @@ class StagePlacer:
         self._leave(left)
 
     def _lose(self, timed: TimedProfiles, lost: NDArray[np.bool_]) -> None:
+        if lost.any():
+            self._lost_ns = int(timed.t_ns[lost].max())
         self.points_without_stage += int(np.count_nonzero(lost))
         of_scan = lost if self._since_ns is None else lost & (timed.edge_ns >= self._since_ns)
         self.points_without_stage_of_scan += int(np.count_nonzero(of_scan))

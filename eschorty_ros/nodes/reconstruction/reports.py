@@ -110,12 +110,17 @@ class Reports:
 
     def _new_losses(self) -> list[str]:
         """Return a line for each loss since the last call."""
-        lost = self._pipeline.stream.packets_lost, self._pipeline.placer.points_without_stage
+        placer = self._pipeline.placer
+        lost = self._pipeline.stream.packets_lost, placer.points_without_stage
         before, self._lost_reported = self._lost_reported, lost
-        return [
+        lines = [
             f"{now - then:,} {what} since the last report, {now:,} so far"
             for now, then, what in zip(
                 lost, before, ("packets lost", "points without stage position"), strict=True
             )
             if now > then
         ]
+        if lost[1] > before[1]:
+            lines[-1] += f"; {placer.lost_why}"
+            self._node.get_logger().warning(lines[-1], throttle_duration_sec=_REMINDER_S)
+        return lines

@@ -54,6 +54,30 @@ def test_a_loss_is_reported_once_beside_other_warnings():
     assert "packets lost" not in reports.diagnose()[1]
 
 
+@pytest.mark.parametrize(
+    ("ahead_s", "why"),
+    [(None, "nothing has come on stage/odom"), (3600.0, "newest sample of stage/odom is +3599.9")],
+)
+def test_points_without_stage_are_logged_with_how_far_its_clock_is(ahead_s, why):
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    pipeline.stream.announce_zero(0)
+    pipeline.stream.set_laser(Modulation(70.0), 1_000_000)
+    if ahead_s is not None:
+        pipeline.add_stage(round(ahead_s * 1e9), 0.0)
+    rng = np.random.default_rng(3)
+    data = encoded(line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=1000))
+    pipeline.stream.add(Packet(0, 0, data), 0.0)
+    pipeline.complete(0.0)
+    assert not pipeline.place(11.0), "seed 3"
+    logged = []
+    logger = SimpleNamespace(warning=lambda line, **_: logged.append(line))
+    node = SimpleNamespace(create_publisher=lambda *_: None, get_logger=lambda: logger)
+    level, line, _ = Reports(node, pipeline, JobQueue(1)).diagnose()
+    assert level == diagnostics.WARN
+    assert why in line
+    assert "points without stage position" in logged[0]
+
+
 def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
     logged = []
