@@ -45,10 +45,11 @@ class ArrayQueue:
             self._first = self._end = 0
 
     def _make_room(self, count: int) -> None:
-        held = len(self)
-        size = max(self._buffers[0].size, 2 * (held + count))
-        grown = tuple(np.empty(size, values.dtype) for values in self._buffers)
-        for new, old in zip(grown, self.arrays, strict=True):
-            new[:held] = old
-        self._buffers = grown
+        held, arrays = len(self), self.arrays
+        size = 2 * (held + count)
+        if size > self._buffers[0].size:
+            self._buffers = tuple(np.empty(size, values.dtype) for values in self._buffers)
+        # In the same buffers they do not overlap: these have twice the room.
+        for buffer, values in zip(self._buffers, arrays, strict=True):
+            buffer[:held] = values
         self._first, self._end = 0, held
