@@ -251,8 +251,8 @@ class InstrumentClient(PacedWaiting):
         while refusal := self._arm_and_enable():
             # The heartbeats of a camera and a stage that have just started come soon.
             if _HEARTBEAT not in refusal or time.monotonic() > ends_s:
-                raise ScanFailure(f"laser: {refusal}")
-            self.waits_for = f"laser: {refusal}"
+                raise ScanFailure(refusal)
+            self.waits_for = refusal
             again_s = time.monotonic() + _ENABLE_AGAIN_S
             while time.monotonic() < again_s:
                 self.tick()
@@ -276,7 +276,7 @@ class InstrumentClient(PacedWaiting):
             if self._heartbeat_on:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
                 if not answer.success:
-                    raise ScanFailure(f"laser: {answer.message}")
+                    raise ScanFailure(str(answer.message))
                 self.wait(lambda: self.monitor.output == LaserOutput.OFF,
                           self._service_timeout_s,
                           "laser: its output does not read back off")  # fmt: skip

@@ -72,5 +72,5 @@ def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
     client.monitor.laser = SimpleNamespace(output=LaserOutput.ON)
     client._feedback = lambda phase: waits.append(client.waits_for)
     client.laser_on()
-    assert set(waits) == {"", f"laser: {reason}"}
+    assert set(waits) == {"", reason}
     assert client.waits_for == ""
