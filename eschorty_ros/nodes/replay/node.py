@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -49,6 +50,7 @@ TABLE = (
 _PACKETS_AHEAD = 256
 _ROWS_AHEAD = 1000
 _POLL_S = 0.005
+_SILENT_S = 2.0
 _STATE_S = 0.5
 _INTERRUPTED = 130
 
@@ -320,11 +322,15 @@ class ReplayNode(Node):
         return self._zero_ns + t_us * NS_PER_US
 
     def _wait(self, condition: Callable[[], bool], fault: str) -> None:
-        timeout_s = self.parameters["timeout"]
+        timeout_s, silent_s = self.parameters["timeout"], _SILENT_S
         while not condition():
             if self._closing.wait(_POLL_S) or not self.context.ok():
                 raise DeviceError("interrupted")
-            if time.monotonic() - self._advanced_s > timeout_s:
+            waited_s = time.monotonic() - self._advanced_s
+            if waited_s > silent_s:
+                silent_s = math.inf
+                self.get_logger().info(f"{fault} yet; waits for {timeout_s:g} s at most")
+            if waited_s > timeout_s:
                 raise DeviceError(f"{fault} for {timeout_s:g} s; check that it runs")
 
     def _call(self, client: Any, request: Any, *, again: bool = False) -> Any:
