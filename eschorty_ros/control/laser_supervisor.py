@@ -55,7 +55,7 @@ class LaserSupervisor:
         # Held briefly, and to disable the output.
         self._lock = threading.RLock()
         self._depth = 0
-        # Callbacks run behind the lock, in the thread of what they are about: one that never
+        # Callbacks run without the lock, in the thread of what they are about: one that never
         # returns must neither keep light on nor a watchdog from its checks.
         self._outbox: deque[Callable[[], None]] = deque()
         self._has_news = False
@@ -253,7 +253,7 @@ class LaserSupervisor:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the lock; behind it, run callbacks if it has news, unless another thread does so."""
+        """Hold the lock; after it, run callbacks if it has news, unless another thread does so."""
         sends = False
         try:
             with self._lock:
@@ -273,7 +273,7 @@ class LaserSupervisor:
         self._has_news = True
 
     def _send(self) -> None:
-        # Looked at again behind each turn: another thread may have added to it in between.
+        # Looked at again after each turn: another thread may have added to it in between.
         while self._outbox and self._sending.acquire(blocking=False):
             try:
                 while self._outbox:

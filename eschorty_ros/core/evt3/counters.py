@@ -49,7 +49,7 @@ class Counters:
     erc_events_in: int = 0
     """Sum of the event counts before the sensor's event-rate controller."""
     erc_events_out: int = 0
-    """And behind it."""
+    """And after it."""
     gaps: int = 0
     """Calls of ``note_gap``."""
     odd_byte: int = 0

@@ -27,7 +27,7 @@ _PLACE = np.uint32(12)
 
 
 class Cut(NamedTuple):
-    """A cut before word ``word``, whose event is the first behind edge number ``edge - 1``."""
+    """A cut before word ``word``, whose event is the first after edge number ``edge - 1``."""
 
     word: np.int64 | int
     edge: int
@@ -89,7 +89,7 @@ def _scan(words, begin, end):
 
 @entry_kernel
 def _find(words, word, edge, edges_us, events, memory):
-    """Advance the decoder to the next cut behind ``events`` events; return it, -1 for none.
+    """Advance the decoder to the next cut after ``events`` events; return it, -1 for none.
 
     ``memory`` is the decoder's at ``word``, the beginning of the open window.
     """

@@ -41,7 +41,7 @@ _RAYLEIGH_MIN = 4.0
 _SQUARE_ENOUGH = 0.6
 # Background reaches this statistic once in 160 000 windows.
 _RAYLEIGH_SURE = 12.0
-# Length of a burst behind an edge, of 2**32 per turn.
+# Length of a burst after an edge, of 2**32 per turn.
 _BURST = 1 << 28
 # Least exponents of Chernoff's bound for the bursts of one polarity, and for those of both.
 _BURST_MIN = 4.0
@@ -204,7 +204,7 @@ def _add_lines(columns, half, place, blink):
 
 @kernel(_nrt=True)
 def _has_bursts(column, first, last, blink):
-    """Return whether many ON events are close behind a rising edge and OFF ones a falling one.
+    """Return whether many ON events are close after a rising edge and OFF ones a falling one.
 
     Chernoff's bound limits the probability that background has them.
     """

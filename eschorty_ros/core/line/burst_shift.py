@@ -5,7 +5,7 @@ fewer events than the pixels give, and loses them in the order of the rows, thos
 the burst have lost one side of the line, and the later ones have not. What the bursts of both
 polarities show is an uncertainty of the row; one of them alone differs where pixels answer the two
 edges of the laser differently. A line that passes an edge has lost one side, too, but not to the
-readout: the sums start again behind the edge. Early events of a line that moves are ahead of the
+readout: the sums start again after the edge. Early events of a line that moves are ahead of the
 late ones, as pixels that were lit before answer later, which is an uncertainty but no fault.
 """
 

@@ -31,7 +31,7 @@ class Columns(NamedTuple):
     - ``events``: Events of the first line.
     - ``room``, ``limit``: Room for the events of a column, and what it may grow to.
     - ``row_first``, ``row_span``: In a region of interest the first row that a column takes, and
-      how many rows behind it; empty without one.
+      how many rows follow it; empty without one.
     - ``refused``: Events that `_bin` did not append, by reason.
     """
 

@@ -52,7 +52,7 @@ _EVENTS_MIN = 4
 # Displacement from profile to profile, in fixed point, at which a gate lags by a few hundredths of
 # a row at most.
 _STILL = 3
-# Profiles one after the other in which the line moves faster; it leaps once to another surface.
+# Profiles one after the other in which the line moves faster; a jump to another surface is one.
 _FASTER_MIN = 3
 # Share of the rows that a gate has to keep.
 _FOUND_MIN = 0.995
@@ -232,8 +232,8 @@ def _learn_gate(columns, half, smoothing, history, levels, gate):
     """Choose the gate from the events of a profile and the lines of the last one.
 
     A gate is chosen again when the line moves twice as fast, in profiles one after the other, or
-    rests behind a leap. The ``levels`` are then those of its events. Returns true in the profile
-    behind the one that changes the gate.
+    rests after a jump. The ``levels`` are then those of its events. Returns true in the profile
+    after the one that changes the gate.
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0

@@ -57,7 +57,7 @@ def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> Erro
 
 @kernel(forceinline=True)
 def _background(excess, count, row, sensor_rows):
-    """Return the number of background events, evenly spread, behind ``excess`` variance.
+    """Return the number of background events, evenly spread, that explain ``excess`` variance.
 
     The second value is the share of their mean square distance that is common to all, as most of
     them are on one side of a line away from the sensor's middle.

@@ -102,7 +102,7 @@ class _Densest(NamedTuple):
 
 @kernel(_nrt=False)
 def _pad(packed, end):
-    """Fill a block behind a column's events."""
+    """Fill a block after a column's events."""
     for i in range(np.uintp(BLOCK)):
         packed[np.uintp(end) + i] = PAD
 

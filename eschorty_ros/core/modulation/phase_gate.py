@@ -33,13 +33,13 @@ class PhaseGate(NamedTuple):
     on_span: int = TURN - 1
     off_begin: int = 0
     off_span: int = TURN - 1
-    """Phase behind the rising edge at which events are kept from, and for how long."""
+    """Phase after the rising edge from which events are kept, and for how long."""
     keeps_late: int = 0
     """1 where other events are kept apart, 0 where they are dropped."""
 
 
 def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
-    """Return the gate behind the edges of ``modulation``; none where its windows cover the period.
+    """Return the gate after the edges of ``modulation``; none where its windows cover the period.
 
     A sine has no edges and is not gated.
 
@@ -91,7 +91,7 @@ def _steps_left(phase, begin, span, step):
 
 @kernel(_nrt=False)
 def _gate_part(t_us, edge_us, gate):
-    """Return the part of a gate that a time is in, which is behind the rising edge."""
+    """Return the part of a gate that a time is in, which is after the rising edge."""
     if gate.step == 0:
         return GatePart(0, 0, 1 << 62)
     phase = np.uint32((t_us - edge_us) * gate.step)

@@ -191,7 +191,7 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
 def _slopes(
     range_mm: NDArray[np.float64], stage_mm: NDArray[np.float64], reach: int
 ) -> NDArray[np.float64]:
-    """Return the slopes between the cells ``reach`` before and behind each; NaN without these."""
+    """Return the slopes between the cells ``reach`` before and after each; NaN without these."""
     slopes = np.full(range_mm.shape, np.nan)
     two = 2 * reach
     if range_mm.shape[1] > two:

@@ -319,7 +319,7 @@ def _begin_period(edges, edge, period, memory):
 
 @kernel(inline="always")
 def _merge_part(events, edges, i, edge, drain, period, memory):
-    """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
+    """Merge events from ``i`` on, and with ``drain`` the edges after the last one."""
     state, rows_max = memory.state, memory.output.row.size - memory.rows.row.size
     t, edges_us = events.t, edges.t_us
     far = np.int64(1 << 62)

@@ -50,7 +50,7 @@ def periods_max(modulation: Modulation) -> int:
 class ProfileLength:
     """Chooses the periods of a profile from the first events that follow the laser.
 
-    The events counted are those of one block. It begins behind the first estimation window that is
+    The events counted are those of one block. It begins after the first estimation window that is
     modulated, or that shows a line where pixels are too slow for the modulation: the choice does
     not depend on how the stream is split, nor on the background before the laser is on. A column
     counts by its pairs of events, which background has few of. One period is a profile where it has
@@ -109,7 +109,7 @@ class ProfileLength:
         return None
 
     def _of_blocks(self, held: HeldEvents, watermark_us: int, last: bool) -> int | None:
-        """Return the periods of a profile by the blocks behind the window, 0 before their end.
+        """Return the periods of a profile by the blocks after the window, 0 before their end.
 
         Where these have no light, drop the window and return ``None``.
         """

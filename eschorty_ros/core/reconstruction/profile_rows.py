@@ -342,7 +342,7 @@ def _few_events(rows, most, state):
 
 @kernel(_nrt=False)
 def _write(rows, smoothing, few, delay_us, state, output):
-    """Write the period's rows behind ``state.rows``, by column, nearest return first."""
+    """Write the period's rows after the ``state.rows`` others, by column, nearest return first."""
     returns, columns = rows.row.shape
     period, edge_us = state.period, state.edge_us
     first = end = np.uintp(state.rows)

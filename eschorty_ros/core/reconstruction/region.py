@@ -38,7 +38,7 @@ def region(columns: Columns, settings: Settings, model: RangeModel) -> Columns:
     lit, first, last = _limits(settings, model)
     if lit.all() and not first.any() and (last == model.rows - 1.0).all():
         return columns
-    # No row is within a span of 0 behind the largest number.
+    # A span of 0 from the largest number on has no row.
     return columns._replace(
         row_first=np.where(lit, np.ceil(first), 0xFFFFFFFF).astype(np.uint32),
         row_span=np.where(lit, np.floor(last) - np.ceil(first), 0).astype(np.uint32),

@@ -197,7 +197,7 @@ def _centroid_shift(before, now, after):
     """Return the shift of the line's centroid towards the rows from which the surface comes, px.
 
     The arguments are full widths of the lit rows on the surface before the step, across it and
-    behind it. The wider side shows ``low / 2 + half`` rows on one side of the centre, the other
+    after it. The wider side shows ``low / 2 + half`` rows on one side of the centre, the other
     ``low / 2``. As the step crosses, rows of the wider side first appear beyond a gap, then
     replace dark rows, then lit ones (no change of width), and at last the narrower side's rows go.
     """

@@ -52,7 +52,7 @@ class WindowAssembler:
     A window begins without knowledge of the events before it, so that any thread can decode it from
     the words' place on: a pass that only counts events finds where, and with which decoder's state.
     That is compared with the state in which the window before ends. Where they differ, in a stream
-    with faults, and where the sensor's edge cuts the line, the window is assembled again, behind
+    with faults, and where the sensor's edge cuts the line, the window is assembled again, after
     the one before it. So rows and counts are those of one assembler, in the same order.
 
     Where nothing comes between rows and ranges the threads compute the ranges, too: rows are
@@ -170,7 +170,7 @@ class WindowAssembler:
             self._each(rows)
 
     def _go_on(self) -> bool:
-        """Assemble the window behind the last one in this thread; return whether it is over."""
+        """Assemble the window after the last one in this thread; return whether it is over."""
         self._hand_on(self._assemble(self._at, self._decoder, self._open))
         return self._open.window_is_over
 

@@ -33,7 +33,7 @@ _PACKET_MIN_US = 1_000
 _AT_ONCE_US = 16_000
 # Those of a dark scene leave together, too.
 _DARK_US = 32_000
-# Sensor time of the first simulation behind a change, and time that later ones may take: reads
+# Sensor time of the first simulation after a change, and time that later ones may take: reads
 # of a camera whose bench is late are not held up.
 _FIRST_US = 200
 _BUSY_S = 0.05

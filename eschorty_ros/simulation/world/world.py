@@ -251,7 +251,7 @@ class World:
     def _draw(self, t_us: int, level: float) -> None:
         """Draw the line on the scene where the stage is in the middle of the time to the next draw.
 
-        The first draw behind an edge lasts half as long, as pixels answer to the light of then.
+        The first draw after an edge lasts half as long, as pixels answer to the light of then.
         """
         position_mm, velocity_mm_s = self._stage.state(t_us)
         pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
