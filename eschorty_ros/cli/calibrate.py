@@ -146,7 +146,7 @@ def command(
     A recording   --distances: posts at these ranges, at least two, sizes helpful; a CSV file
                   has range_mm[,range_sigma_mm][,size_mm][,column][,row][,label]
                   --moving: a flat target that the stage moves along the range; give sweeps
-                forth and back, because a moving line is measured late
+                back and forth, because a moving line is measured late
 
     \b
     Verdicts

@@ -114,7 +114,7 @@ def command(
     also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
     within_1_sigma, within_2_sigma, off_target (points where nothing is), flagged, and
     good_median_mm, good_p95_mm, good_within_1_sigma and good_within_2_sigma of the points without a
-    flag; without those that no point gives. Where passes forth and back show a lag, pass_lag_ms has
+    flag; without those that no point gives. Where passes back and forth show a lag, pass_lag_ms has
     it and its sigma. Of several recordings it prints one object a line, with recording first, and
     error alone where it failed.
 

@@ -335,7 +335,7 @@ class Pipeline:
         """Return the scan that was collected; what still waits for the stage is lost.
 
         Points are placed again, by the clock as fitted to the entire sweep, and less the lag that
-        passes forth and back show.
+        passes back and forth show.
         """
         assert self._buffer is not None
         buffer, self._buffer = self._buffer, None

@@ -83,7 +83,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "moved target are simulated with the event pixels of the preset paper, the truth is "
             "known.",
             f"The posts are at {near.range_mm:.0f} to {far.range_mm:.0f} mm and are found "
-            "in the sum of all events. The target moved by the stage is swept forth and back "
+            "in the sum of all events. The target moved by the stage is swept back and forth "
             "at two places, with one known range per profile.",
         ],
     )

@@ -45,7 +45,7 @@ def moving_target(
     """Turn every profile of a moving flat target into a target of known range.
 
     The events of a line that moves over the pixels lag it by a fraction of a row, at any speed:
-    join sweeps forth and back (``Targets.concatenate``), and the lag cancels.
+    join sweeps back and forth (``Targets.concatenate``), and the lag cancels.
 
     Targets come by time, then column, in the columns with points in half of the profiles; the
     label is the stage position in mm. Profiles more than 4 px off the line through the others, or

@@ -7,7 +7,7 @@ rows. The mean of all events is nearer to the kind with more of them, and its di
 middle is its uncertainty, up to the displacement of the line from profile to profile, which is that
 of events of one kind alone.
 
-Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
+Rows that jump back and forth, all columns alike, have successive differences of opposite sign.
 The mean square of the smaller one, with that sign, shows the variance of the jumps; a steady
 displacement has none, nor has a single jump to another surface.
 
@@ -60,7 +60,7 @@ class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
-    ``jitter2`` the variance of rows that jump forth and back. The ``same_width`` has been the same
+    ``jitter2`` the variance of rows that jump back and forth. The ``same_width`` has been the same
     for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last that was for
     some.
     """
@@ -244,7 +244,7 @@ def _motion_variance(history, block, row, own2, weight):
 
 @kernel(_nrt=False)
 def _jitter_variance(recent, block, row, own2, weight, alike):
-    """Return the variance of rows that jump forth and back, px squared; see `_motion_variance`.
+    """Return the variance of rows that jump back and forth, px squared; see `_motion_variance`.
 
     Jumps of more than a row count where blocks move ``alike``.
     """

@@ -59,7 +59,7 @@ class Result:
     organized: NDArray[np.void] | None = None
     """``points`` as a height map, shape (profiles, columns), with the setting ``organized``."""
     pass_lag: PassLag | None = None
-    """What has been taken off times and places of the points, which passes forth and back show."""
+    """What has been taken off times and places of the points, which passes back and forth show."""
 
     @property
     def events_per_second(self) -> float:

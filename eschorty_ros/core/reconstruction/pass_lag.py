@@ -1,4 +1,4 @@
-"""How late the points of a scan forth and back are, from the two passes.
+"""How late the points of a scan back and forth are, from the two passes.
 
 Pixels respond late to a line that moves, so that a row shows an earlier surface. A pass forth and
 one back are late in opposite directions along the stage: where they overlap, ranges differ by the

@@ -47,7 +47,7 @@ TABLE = (
     Param("frequency", 0.0, "auto_scan: modulation frequency; 0 keeps the laser's", "Hz",
           0.0, FREQUENCY_MAX_HZ),
     Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
-    Param("passes", 1, "auto_scan: sweeps forth and back", "", 1, PASSES_MAX),
+    Param("passes", 1, "auto_scan: sweeps back and forth", "", 1, PASSES_MAX),
     Param("approach_speed", 0.1, "speed towards the start", "m/s", _SPEED_MIN, 1.0),
     # Without `eschorty compile` the nodes of a first run answer later still.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),

@@ -20,7 +20,7 @@ SPEED_MM_S = 100.0
 
 @pytest.fixture(scope="module")
 def sweeps(tmp_path_factory) -> list[tuple[float, Profiles, np.ndarray]]:
-    """Profiles of a plane that the stage moves, standing at two places, forth and back at each."""
+    """Profiles of a plane that the stage moves, standing at two places, back and forth at each."""
     made = []
     for at_zero_mm in (850.0, 1800.0):
         for start_mm, stop_mm in ((10.0, 210.0), (210.0, 10.0)):

@@ -1,4 +1,4 @@
-"""Lag of the points of scans forth and back, and what is left of it."""
+"""Lag of the points of scans back and forth, and what is left of it."""
 
 from dataclasses import replace
 

@@ -359,7 +359,7 @@ def test_killed_camera_ends_the_calibration(instrument: Instrument) -> None:
 
 
 def test_a_target_moved_by_the_stage_calibrates_too(instrument: Instrument) -> None:
-    """One target that the stage moves forth and back gives range within 1 mm RMS where it was."""
+    """One target that the stage moves back and forth gives range within 1 mm RMS where it was."""
     instrument.point_camera_at("receding")
     bench = instrument.bench
     status, result = bench.calibrate(
