@@ -76,7 +76,7 @@ def crossing(
       shape (columns,).
     - ``columns``: Columns on the step; ``BOARD_COLUMNS`` more are on the board.
     - ``margin_rows``: Distance from the line's centre at which the step begins and ends.
-    - ``slanted``: Spread the step's position over the columns by its way between profiles;
+    - ``slanted``: Spread the step's position over the columns by its displacement between profiles;
       otherwise it is at the centre of all columns at once in the middle profile.
     """
     step = rows_per_profile(frequency_hz)

@@ -114,11 +114,11 @@ def _centre(pixels):
 
 
 @kernel
-def _is_lopsided(pixels, lit_way_px):
+def _is_lopsided(pixels, lit_displacement_px):
     """Return whether the mean of the counts by place is not in the middle of their ends.
 
     Of a line that moves while it is lit, rows at one end may have all events and as many at the
-    other none: that is half of its way.
+    other none: that is half of its displacement.
     """
     mean = _mean_counts(pixels).mean
     low = high = np.argmax(mean)
@@ -129,4 +129,4 @@ def _is_lopsided(pixels, lit_way_px):
         high += 1
     places = np.arange(low, high + 1)
     centre = (places * mean[low : high + 1]).sum() / max(mean[low : high + 1].sum(), 1e-9)
-    return abs(centre - 0.5 * (low + high)) > (_LOPSIDED_PX + 0.5 * lit_way_px) * _PLACES
+    return abs(centre - 0.5 * (low + high)) > (_LOPSIDED_PX + 0.5 * lit_displacement_px) * _PLACES

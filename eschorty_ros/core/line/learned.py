@@ -284,16 +284,16 @@ def _centre_error_px(footprint):
 
 
 @kernel
-def _compute(footprint, whole, lit_way_px):
+def _compute(footprint, whole, lit_displacement_px):
     """Compute the logarithms from the counts of pixels, of ``whole`` lines or of cut ones.
 
-    The lines move by ``lit_way_px`` while they are lit.
+    The lines move by ``lit_displacement_px`` while they are lit.
     """
     pixels, log, none = footprint.pixels, footprint.log, footprint.none
     size = pixels.shape[1]
     shares = pixels + pixels[:, ::-1]
     if whole:
-        footprint.state.lopsided += _is_lopsided(pixels, lit_way_px)
+        footprint.state.lopsided += _is_lopsided(pixels, lit_displacement_px)
     else:
         middle = size // 2
         centre, footprint.state.away = _centre(pixels)
@@ -335,12 +335,12 @@ def _compute(footprint, whole, lit_way_px):
 
 
 @kernel(_nrt=True)
-def _learn(footprint, rows, smoothed, sensor_rows, lit_way_px):
+def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
     Columns in which the sensor's edge cuts the line count where few others are, alone and at the
-    distances from their mean rows, which are all off by about as much. Lines move by ``lit_way_px``
-    while they are lit.
+    distances from their mean rows, which are all off by about as much. Lines move by
+    ``lit_displacement_px`` while they are lit.
     """
     row, uncertain, truncated = rows.row[0], rows.uncertain[0], rows.truncated[0]
     state = footprint.state
@@ -369,7 +369,7 @@ def _learn(footprint, rows, smoothed, sensor_rows, lit_way_px):
     state.profiles += 1
     doublings = min(max(state.computations - _ROUNDS, 0), _DOUBLINGS)
     if state.columns >= _COLUMNS_MIN << doublings:
-        _compute(footprint, whole, lit_way_px)
+        _compute(footprint, whole, lit_displacement_px)
         state.all_cut = not whole
         # Distances from mean rows do not depend on the footprint.
         pixels *= 0.0 if whole else 0.5

@@ -431,8 +431,8 @@ def _learn_line(memory, half, learns, late):
         _restart_from(memory.known, footprint)
     if learns:
         computations, lopsided = footprint.state.computations, footprint.state.lopsided
-        lit_way_px = memory.light.lit_share * _mean_step_px(history)
-        _learn(footprint, rows, memory.smoothing.row[0], estimator.sensor_rows, lit_way_px)
+        lit_displacement_px = memory.light.lit_share * _mean_step_px(history)
+        _learn(footprint, rows, memory.smoothing.row[0], estimator.sensor_rows, lit_displacement_px)
         counters.footprints += footprint.state.computations - computations
         counters.footprints_lopsided += footprint.state.lopsided - lopsided
     if state.known_half == 0:
