@@ -378,12 +378,12 @@ def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px):
 
 
 @kernel(_nrt=True)
-def _choose(footprint, row, history, late, always):
+def _choose(footprint, row, history, is_last, always):
     """Choose between learned rows and the means ``row`` by those of some profiles with both.
 
-    With ``always`` it is the learned rows. It is the means where learned rows are not seen before
-    it is ``late``. Of a line that moves fast, by its ``history``, learned rows also lag less,
-    which scatter does not show. Returns true when a choice was made.
+    With ``always`` it is the learned rows. It is the means where no profile up to the one that
+    ``is_last`` has shown learned rows. Of a line that moves fast, by its ``history``, learned rows
+    also lag less, which scatter does not show. Returns true when a choice was made.
     """
     state = footprint.state
     if state.choice != UNDECIDED:
@@ -395,7 +395,7 @@ def _choose(footprint, row, history, late, always):
             state.scatter_learned += np.int64(1e6 * min(learned, 1e6))
             state.trials += 1
         footprint.trial[:] = 0.0
-    if late or state.trials == _TRIALS or (always and state.trying > 0):
+    if is_last or state.trials == _TRIALS or (always and state.trying > 0):
         least = (1.0 if _moves_fast(history) else _PAYS) * state.scatter
         pays = always or state.scatter_learned < least
         state.choice = LEARNED_ROWS if pays else MEAN_ROWS

@@ -416,17 +416,17 @@ def _follow(memory, half, restarted):
 
 
 @kernel(inline="always")
-def _learn_line(memory, half, learns, late):
+def _learn_line(memory, half, learns, is_last):
     """Learn the footprint, the widths and the gate, and keep what later windows begin with.
 
-    ``half`` is the half width of the period's windows, ``late`` true in the last one of a window
-    of events.
+    ``half`` is the half width of the period's windows; the period ``is_last`` in a window of
+    events.
     """
     state, counters, footprint = memory.state, memory.counters, memory.footprint
     estimator, rows, history = memory.estimator, memory.rows, memory.history
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
-    if _choose(footprint, rows.row[0], history, late and enough, always):
+    if _choose(footprint, rows.row[0], history, is_last and enough, always):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
@@ -451,7 +451,7 @@ def _close(memory):
     state, counters, estimator = memory.state, memory.counters, memory.estimator
     scatter, smoothing, rows = memory.scatter, memory.smoothing, memory.rows
     _gate_late(memory)
-    learns, late = _learns(memory.footprint), state.window >= memory.window_events
+    learns, is_last = _learns(memory.footprint), state.window >= memory.window_events
     half = state.half
     sums = _estimate_columns(
         memory.columns, half, estimator, memory.blink, memory.footprint, rows, memory.row_counts
@@ -479,12 +479,12 @@ def _close(memory):
     counters.points_followed += followed.points
     counters.points_burst_shift += followed.shifted
     counters.points_one_polarity += followed.of_one_polarity
-    _learn_line(memory, half, learns, late)
+    _learn_line(memory, half, learns, is_last)
     delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
     points = np.int64(state.rows - before)
     state.points += points
     state.points_most = max(state.points_most, points)
-    if late and state.known_half > 0:
+    if is_last and state.known_half > 0:
         _begin_window(memory)
