@@ -133,16 +133,23 @@ COUNTERS = (
 )
 CLOSED, EMPTY, FILLED = 0, 1, 2
 """Status of the open period: there is none, it has no events, it has some."""
-# ``part_us`` is where the part of the gate begins, ``half`` the half width of a window for the open
-# period in fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs
-# more room, ``window`` and ``profiles`` the numbers of events and profiles since the estimate
-# started, ``over`` 1 where a pass ended with it. ``points`` are those since the restart,
-# ``points_most`` the most of a profile, ``known_half`` is 0 until windows begin with what is known.
-# ``recent_points`` and ``recent_events`` are sums over recent profiles.
 _STATE = (
-    "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "profiles", "over",
-    "points", "points_most", "known_half", "recent_points", "recent_events",
-)  # fmt: skip
+    "period",
+    "edge_us",
+    "part_us",  # where the part of the gate begins
+    "status",  # CLOSED, EMPTY or FILLED
+    "half",  # half width of the open period's windows, fixed point
+    "rows",  # in the output
+    "full",  # 1 while a column needs more room
+    "window",  # events since the estimate of the line started
+    "profiles",  # since then
+    "over",  # 1 where a pass ended with the window
+    "points",  # since the restart
+    "points_most",  # the most of a profile
+    "known_half",  # ``half`` with which later windows begin, 0 until it is known
+    "recent_points",  # sum over recent profiles, as the next one
+    "recent_events",
+)
 
 
 class _Output(NamedTuple):
