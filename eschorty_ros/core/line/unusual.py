@@ -312,6 +312,34 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
 
 
+@kernel
+def _reach(columns, sigma):
+    """Return the standard deviation, in bins, of a width that is a mean of this many ``columns``.
+
+    ``sigma`` is that of the mean of `WIDTH_COLUMNS`, px.
+    """
+    share = WIDTH_COLUMNS / min(columns, WIDTH_COLUMNS)
+    return np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
+
+
+@kernel(_nrt=False)
+def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
+    """Return the variance of a row at an edge, px squared, and the weight of its line's width.
+
+    ``sigma`` is the standard deviation of widths, px, ``reach`` the same in bins. A row ``moves``
+    that has changed since the last profile by more than it scatters.
+    """
+    known, width = _is_known(widths), widths.static_width[k, c]
+    edge2 = _changed_variance(widths, known, k, c, smoothing.row[k, c], sigma)
+    if not known:
+        return edge2, 1.0
+    edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, np.sqrt(WIDTH_COLUMNS) * sigma))
+    if _is_usual(widths.below, width, reach):
+        return edge2, 1.0
+    weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
+    return max(edge2, _unusual_variance(width, widths.usual.median.width)), weight
+
+
 @kernel(_nrt=False)
 def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
@@ -322,7 +350,6 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
-    sigma_own = np.sqrt(WIDTH_COLUMNS) * sigma
     pairs = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
@@ -346,15 +373,9 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
                 continue
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
-                share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
-                reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
-            weight, edge2 = 1.0, _changed_variance(widths, known, k, c, row[k, c], sigma)
-            if known:
-                edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, sigma_own))
-                if not _is_usual(widths.below, width, reach):
-                    steady = not displacement * displacement > STEADY**2 * row2
-                    weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
-                    edge2 = max(edge2, _unusual_variance(width, usual))
+                reach = _reach(averaged, sigma)
+            moves = displacement * displacement > STEADY**2 * row2
+            edge2, weight = _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves)
             if not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
