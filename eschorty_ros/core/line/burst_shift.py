@@ -60,7 +60,7 @@ class Bursts(NamedTuple):
     """Sums over recent profiles by block of columns, polarity and part of the burst.
 
     Early events, part 0, are before the phase ``late``, of 2**32 per turn: three of four. The first
-    and the last block are outside the sensor. The sums of a block are of so many ``profiles``.
+    and the last block are outside the sensor. ``profiles`` is how many the sums of a block are of.
     """
 
     events: NDArray[np.float64]
@@ -173,9 +173,10 @@ def _keep_sums(bursts, block, share):
 
 @kernel(_nrt=False)
 def _compare_bursts(columns, half, profiles, blink, common2, bursts, history):
-    """Add one column of each block, and set the shifts of the bursts after so many ``profiles``.
+    """Add one column of each block to its sums, and set the shifts in every fourth profile.
 
-    ``common2`` are the variances that the rows of neighbours share, px squared, by column.
+    ``profiles`` is the number of those before in the window of events. ``common2`` are the
+    variances that the rows of neighbours share, px squared, by column.
     """
     if blink.step == 0:
         return

@@ -136,7 +136,7 @@ def _is_new(columns, c, window, half):
 
 @kernel
 def _set_second(columns, c, window, excess, half):
-    """Set a column's second line, which has so many events less than the first one."""
+    """Set a column's second line, which has ``excess`` events less than the first one."""
     again = _is_second(columns, c, window, half)
     columns.second_seen[c] = columns.second_seen[c] + 1 if again else 1
     columns.second_rows[c], columns.excess[c] = window.centre, excess
@@ -212,7 +212,7 @@ def _is_cut(window, sensor_rows):
 
 @kernel
 def _is_alone(used, events):
-    """Return whether a window has so many of the events that no other is nearly as strong."""
+    """Return whether a window has more than two of three events: no other is nearly as strong."""
     return 3 * used > 2 * events
 
 

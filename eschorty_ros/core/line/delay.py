@@ -15,7 +15,7 @@ import numpy as np
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.modulation import Modulation
 
-# Before so many points their mean time is not known to a sixteenth of its scatter.
+# Before this many points their mean time is not known to a sixteenth of its scatter.
 _POINTS_MIN = 256
 # A larger one, us or share of the period, is an error of the phase.
 _DELAY_MAX_US = 1000.0

@@ -34,7 +34,7 @@ _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uint
 _LOG_ONE = 64
 # The least log-likelihood of a row in steps, and the least of all rows, which fits 16 bits.
 _LOG_MIN, _LOG_SUM_MIN = -512, -(1 << 15)
-# Of every so many columns one is learned from in a profile.
+# One of this many columns is learned from in a profile.
 _STRIDE = 4
 # Columns after which the footprint is computed again. Rows found with an earlier footprint are less
 # exact, so its counts are forgotten.
@@ -44,9 +44,9 @@ _ROUNDS = 3
 _DOUBLINGS = 5
 # Each averages a place with its neighbours, which all smooth over a quarter of a row.
 _SMOOTHING_PASSES = 4
-# A prior of so many pixels at each distance.
+# A prior of this many pixels at each distance.
 _PRIOR_PIXELS = 2.0
-# A prior of so many pixels with each count.
+# A prior of this many pixels with each count.
 _PRIOR_COUNT = 0.02
 # Most moves of the candidates towards the greatest likelihood.
 _MOVES_MAX = 24

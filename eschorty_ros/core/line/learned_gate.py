@@ -65,7 +65,7 @@ class LearnedGate(NamedTuple):
     ``known`` once one is chosen, and has ``changed`` if that is another than before; its ``late``
     is the usual number of late events of a column, ``half`` the half width of the windows of rows
     in which it is chosen, 0 before, and ``moving`` the displacement of the line then. The line has
-    moved ``faster`` in so many of the last profiles. Windows begin with the gate that is ``kept``.
+    moved faster in the last ``faster`` profiles. Windows begin with the gate that is ``kept``.
     """
 
     state: Any

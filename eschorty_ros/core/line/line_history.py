@@ -38,8 +38,8 @@ RECENT_PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
-# A width or row is the same while it changes by so many deviations at most, and steady when it has
-# been so for more than two profiles.
+# A width or row is the same while it changes by this many deviations at most, and steady when it
+# has been so for more than two profiles.
 STEADY = 2.0 * np.sqrt(2.0)
 STEADY_PROFILES = 2.0
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that

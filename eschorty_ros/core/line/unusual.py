@@ -47,7 +47,7 @@ _MOVING_WEIGHT = 0.05
 _POINTS_MIN = 512.0
 # Points that count, in profiles of all columns.
 _PROFILES_KEPT = 256
-# The widths that a window begins with count as so many profiles.
+# The widths that a window begins with count as this many profiles.
 _PROFILES_KNOWN = 16
 # Steps of the running median of differences are this share of it, larger ones at first.
 _STEP = 1.0 / 1024.0
@@ -258,7 +258,7 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
 
 @kernel
 def _moved_median(median, value, values):
-    """Return the running median of so many ``values``, moved towards the last one."""
+    """Return the running median of ``values`` in number, moved towards the last one, ``value``."""
     step = max(1.0 / values, _STEP)
     if median == 0.0:
         return (1.0 - step) * value

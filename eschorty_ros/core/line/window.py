@@ -93,7 +93,7 @@ class Returns(NamedTuple):
 
 
 class _Densest(NamedTuple):
-    """Most events in a box, and the lowest and the highest row whose box has so many."""
+    """Most events in a box, and the lowest and the highest row whose box has as many."""
 
     events: np.int64
     lowest: np.int64
@@ -330,7 +330,7 @@ def _exceeds_background(events, others, half, rows_taken):
 
 @kernel
 def _chernoff_exponent(events, expected):
-    """Return minus the logarithm of Chernoff's bound on the chance of so many events, or more."""
+    """Return minus the logarithm of Chernoff's bound on the chance of ``events`` or more."""
     return events * np.log(events / expected) - (events - expected) if events > expected else 0.0
 
 

@@ -16,8 +16,8 @@ from eschorty_ros.core.modulation.modulation import Modulation
 _WINDOW_PERIODS = 4
 _WINDOW_EVENTS = 2048
 _HISTOGRAM_BINS = 200
-# A readout that takes one row after the other may leave so long without an event in a burst, and
-# so many bins are taken as such at most: noise fills some.
+# A readout that takes one row after the other may leave this long without an event in a burst, and
+# at most this many bins are taken as such: noise fills some.
 _ROW_US = 3.0
 _GAP_BINS_MAX = 3
 # Strength squared times the events: exponential with mean 1 where they are not modulated.

@@ -144,7 +144,7 @@ class PhaseLock:
         self._observed = inside < t_us.size and self._count >= _EVENTS_ENOUGH
 
     def _keep(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
-        """Keep every so many events, twice as many when there is no room."""
+        """Keep one event of each stride; double the stride when there is no room."""
         at = -self._seen % self._stride
         while at < t_us.size:
             if self._count == self._t.size:

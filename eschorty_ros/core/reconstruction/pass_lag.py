@@ -24,13 +24,13 @@ _BANDS = 16
 # side: the thickness of the line makes a slope of a step.
 _SLOPE_MAX = 1.0
 _SMOOTH_MM = 8.0
-# Least cells of a band, and bands with so many.
+# Least cells of a band, and least bands that have them.
 _CELLS_MIN = 16
 _BANDS_MIN = 4
-# Cells further off than so many deviations show something that moved between the passes.
+# Cells further off than this many deviations show something that moved between the passes.
 _DEVIATIONS_MAX = 4.0
 _ROUNDS = 3
-# A lag of less than so many standard deviations is none.
+# A lag of less than this many standard deviations is none.
 _SURE = 3.0
 # Half the time over which the stage's speed is measured.
 _SPEED_US = 20_000

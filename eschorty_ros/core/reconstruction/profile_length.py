@@ -206,7 +206,7 @@ def _between_events(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _are_even(in_period: NDArray[np.int64], periods: int) -> bool:
-    """Return whether profiles of so many periods have about the same number of events."""
+    """Return whether profiles of ``periods`` have about the same number of events."""
     whole = in_period[: len(in_period) // periods * periods]
     profiles = whole.reshape(-1, periods).sum(axis=1)
     return bool(profiles.std() <= _UNEVEN_SHARE * profiles.mean())
@@ -226,7 +226,7 @@ def _with_even_rows(candidates: list[int], counts: NDArray[np.int64], sums: Arra
 
 
 def _row_variance(counts: NDArray[Any], sums: Array, periods: int) -> float:
-    """Return the variance of rows from one profile of so many periods to the next, NaN of none."""
+    """Return the variance of rows from one profile of ``periods`` to the next, NaN of none."""
     shape = len(counts) // periods, periods, -1
     whole = slice(shape[0] * periods)
     number, total = (values[whole].reshape(shape).sum(axis=1) for values in (counts, sums))

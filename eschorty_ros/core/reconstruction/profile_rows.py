@@ -293,7 +293,7 @@ def _clear_line(memory):
 def _is_examined(memory, profiles):
     """Return whether the events of some columns are examined one by one: until the width is known.
 
-    Later what they show changes slowly: so many ``profiles`` of 16 are enough. Full columns have no
+    Later what they show changes slowly: ``profiles`` of 16 are enough. Full columns have no
     line that can be examined.
     """
     state = memory.state

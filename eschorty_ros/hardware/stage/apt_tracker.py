@@ -28,7 +28,7 @@ _READINGS_AT_REST = 2
 _POLL_LOST_NS = 250_000_000
 # Larger than any drift between two messages and any step of a simulated clock.
 _CLOCK_SET_NS = 500_000_000
-# After a stall of the host, statuses may still wait to be read: so many checks come first.
+# After a stall of the host, statuses may still wait to be read: this many checks come first.
 _LATE_CHECKS_MIN = 5
 _AGE_CHECKS_MIN = 20
 

@@ -69,7 +69,7 @@ class PacketPublisher:
         self._packetizer.dark = value
 
     def begin(self, width: int, height: int, age_ns: int, size_bytes: int) -> None:
-        """Publish a sensor of so many columns and rows in packets at this age or size."""
+        """Publish a sensor of this size in packets of this age or size."""
         if (width, height) != (self._decoder.width, self._decoder.height):
             self._decoder = Decoder(width, height)
         self._width, self._height = width, height

@@ -16,7 +16,7 @@ import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
 
-# After so many time constants an exponential is below half a unit in the last place of the sum.
+# After this many time constants an exponential is below half a unit in the last place of the sum.
 _SETTLED = 38.0
 
 ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2

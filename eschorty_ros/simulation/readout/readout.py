@@ -39,7 +39,7 @@ class EventRate:
     """
 
     events: int
-    """The first so many events of every period leave the sensor; the others are dropped."""
+    """First events of every period that leave the sensor; the others are dropped."""
     period_us: int
 
     def __post_init__(self) -> None:
