@@ -161,8 +161,8 @@ def _append_event(bins, n, t_us, column, row, polarity):
     if not _is_selected(bins, c, r, late):
         return n + np.uint64(1)
     if events < bins.room:
-        behind = np.uintp(2) * c + np.uintp(late > 0)
-        at = behind * np.uintp(bins.room + np.uint32(PADDING))
+        slot = np.uintp(2) * c + np.uintp(late > 0)
+        at = slot * np.uintp(bins.room + np.uint32(PADDING))
         bins.packed[at + np.uintp(events)] = np.uint32(
             (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
             | (np.uint32(polarity) << np.uint32(ROW_BITS))
