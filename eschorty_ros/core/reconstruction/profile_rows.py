@@ -168,7 +168,11 @@ class _Output(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Settings and memory of the pass from events to rows, its state and what it counts."""
+    """Settings and memory of the pass from events to rows, its state and what it counts.
+
+    Windows of events begin with the footprint ``known`` and the ``known_widths``. ``two_lines`` are
+    the counts of `_single_half`, ``delay`` the sums of `_delay_us`.
+    """
 
     columns: Columns
     estimator: Estimator
