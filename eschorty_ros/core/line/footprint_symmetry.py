@@ -114,7 +114,7 @@ def _centre(pixels):
 
 
 @kernel
-def _is_lopsided(pixels, lit_displacement_px):
+def _is_asymmetric(pixels, lit_displacement_px):
     """Return whether the mean of the counts by place is not in the middle of their ends.
 
     Of a line that moves while it is lit, rows at one end may have all events and as many at the

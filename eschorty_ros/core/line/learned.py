@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.estimators import _mean
-from eschorty_ros.core.line.footprint_symmetry import _PLACES, _centre, _is_lopsided
+from eschorty_ros.core.line.footprint_symmetry import _PLACES, _centre, _is_asymmetric
 from eschorty_ros.core.line.line_history import _moves_fast
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
@@ -72,7 +72,7 @@ class Footprint(NamedTuple):
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
     since; ``all_cut`` is 1 where the last one is of lines that are all cut, whose centre may be so
-    many places ``away``; ``lopsided`` counts those of lines that are so, ``near_edge`` is 1 while
+    many places ``away``; ``asymmetric`` counts those of lines that are so, ``near_edge`` is 1 while
     the sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in
     profiles of the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the
     sums of how much their rows scatter, in millionths of a row. ``choice`` is what followed from
@@ -113,7 +113,7 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
             "columns",
             "all_cut",
             "away",
-            "lopsided",
+            "asymmetric",
             "near_edge",
             "trying",
             "trials",
@@ -293,7 +293,7 @@ def _compute(footprint, whole, lit_displacement_px):
     size = pixels.shape[1]
     shares = pixels + pixels[:, ::-1]
     if whole:
-        footprint.state.lopsided += _is_lopsided(pixels, lit_displacement_px)
+        footprint.state.asymmetric += _is_asymmetric(pixels, lit_displacement_px)
     else:
         middle = size // 2
         centre, footprint.state.away = _centre(pixels)

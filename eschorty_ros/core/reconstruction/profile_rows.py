@@ -129,7 +129,7 @@ COUNTERS = (
     "points_followed",
     "points_one_polarity",
     "footprints",
-    "footprints_lopsided",
+    "footprints_asymmetric",
 )
 CLOSED, EMPTY, FILLED = 0, 1, 2
 """Status of the open period: there is none, it has no events, it has some."""
@@ -441,11 +441,11 @@ def _learn_line(memory, half, learns, is_last):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:
-        computations, lopsided = footprint.state.computations, footprint.state.lopsided
+        computations, asymmetric = footprint.state.computations, footprint.state.asymmetric
         lit_displacement_px = memory.light.lit_share * _mean_step_px(history)
         _learn(footprint, rows, memory.smoothing.row[0], estimator.sensor_rows, lit_displacement_px)
         counters.footprints += footprint.state.computations - computations
-        counters.footprints_lopsided += footprint.state.lopsided - lopsided
+        counters.footprints_asymmetric += footprint.state.asymmetric - asymmetric
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.

@@ -81,12 +81,12 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
     elif share > _BURST_SHIFT_SHARE:
         found.append(
             f"early and late events of a burst have different rows in {share:.0%} of the "
-            "points: the readout loses one side of the line, or the line is lopsided; sigma "
+            "points: the readout loses one side of the line, or the line is asymmetric; sigma "
             f"has the difference; {_FEWER_EVENTS}"
         )
-    elif 2 * counts["footprints_lopsided"] > counts["footprints"]:
+    elif 2 * counts["footprints_asymmetric"] > counts["footprints"]:
         found.append(
             "the mean of the line's rows is not in the middle of its ends: the readout loses one "
-            f"side, or the line is lopsided; calibrate with this light, or {_FEWER_EVENTS}"
+            f"side, or the line is asymmetric; calibrate with this light, or {_FEWER_EVENTS}"
         )
     return found

@@ -385,11 +385,11 @@ def test_a_line_that_has_lost_one_side_at_all_times_has_a_warning(lost, half_wid
     period = (t - FIRST_EDGE_US) * camera.frequency_hz // 1e6
     kept = (y < wavy(period, x)) | (not lost)
     _, reconstructor = points(camera, (t[kept], x[kept], y[kept], p[kept]))
-    assert any("the line is lopsided" in line for line in reconstructor.warnings) == lost
+    assert any("the line is asymmetric" in line for line in reconstructor.warnings) == lost
 
 
 @pytest.mark.parametrize("towards", [1, -1])
-def test_a_line_that_moves_while_it_is_lit_is_not_lopsided(towards):
+def test_a_line_that_moves_while_it_is_lit_is_not_asymmetric(towards):
     """Pixels that it reaches late give fewer ON events."""
     camera = Camera(periods=30)
     t, x, y, p = camera.moving_line(lambda k, c: 230.0 + 8.0 * k + 0.0 * c, 4)
@@ -399,7 +399,7 @@ def test_a_line_that_moves_while_it_is_lit_is_not_lopsided(towards):
     found, reconstructor = points(camera, (t, x, y if towards > 0 else 719 - y, p))
     assert len(found) > 0.99 * camera.periods * CALIBRATION.columns, f"seed {camera.seed}"
     assert reconstructor.counters["footprints"] > 0
-    assert not any("lopsided" in line for line in reconstructor.warnings)
+    assert not any("asymmetric" in line for line in reconstructor.warnings)
 
 
 @pytest.mark.parametrize(("share", "error_max_mm"), [(0.22, 1.0), (0.5, 0.5)])
