@@ -56,8 +56,11 @@ def _scatter_of(sums):
 
 
 @kernel(_nrt=False)
-def _column_sides(packed, start, seed, half):
-    """Return the variance of a column's rows, and that on either side of their mean.
+def _column_sides(packed, start, seed, half, unequal):
+    """Return the variance of a column's rows, and that on either side of a row that parts them.
+
+    It is their mean. The mean of ``unequal`` lines is in the stronger one: these are parted in the
+    middle of both sides' means.
 
     Events of one polarity count, the one with more: those of a line that moves while it is lit are
     apart. Zeros where there are too few.
@@ -67,18 +70,25 @@ def _column_sides(packed, start, seed, half):
     more = on if on[0] >= off[0] else off
     if more[0] < _EVENTS_MIN:
         return 0.0, 0.0
-    low, high = _side_sums(packed, start, seed, half, on[0] >= off[0], more[1] / more[0])
+    low = high = more
+    parting, before = more[1] / more[0], np.inf
+    while parting != before and high[0] > 0.0:
+        low, high = _side_sums(packed, start, seed, half, on[0] >= off[0], parting)
+        middle = 0.5 * (low[1] / low[0] + high[1] / max(high[0], 1.0))
+        before = parting
+        parting = middle if unequal else parting
     sides = _scatter_of(low) + _scatter_of(high)
     return _scatter_of(more) / more[0] + _PIXEL2, sides / more[0] + _PIXEL2
 
 
 @kernel(_nrt=False)
-def _single_half(columns, half, successive):
+def _single_half(columns, half, successive, profiles):
     """Return the half width of the window of one line where most columns have two in it, else 0.
 
     Such windows would give the mean of both lines, and go on to be as wide. A column has two lines
     when three profiles show them, since pixels in the middle of a bright line may answer in every
-    second or third period only. ``successive`` has the number so far, one per column tested.
+    second or third period only. ``successive`` has the number so far, one per column tested. Lines
+    may be unequal where all ``profiles`` so far had two; later a step that passes has such parts.
     """
     lines, two, total = 0, 0, 0.0
     apart = max(columns.seeds.size // successive.size, 1)
@@ -86,7 +96,9 @@ def _single_half(columns, half, successive):
         c = k * np.uintp(apart)
         whole, sides = 0.0, 0.0
         if columns.seeds[c] >= 0:
-            whole, sides = _column_sides(columns.packed, columns.starts[c], columns.seeds[c], half)
+            whole, sides = _column_sides(
+                columns.packed, columns.starts[c], columns.seeds[c], half, successive[k] == profiles
+            )
         lines += whole > 0.0
         has_two = whole > _VARIANCE_MIN and sides < _SIDES * whole
         successive[k] = successive[k] + 1 if has_two else 0

@@ -473,7 +473,8 @@ def _close(memory):
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     single = np.int64(0)
     if _is_examined(memory, PROFILES):
-        single = _single_half(memory.columns, half, memory.two_lines)
+        profiles = state.profiles if state.known_half == 0 else -1
+        single = _single_half(memory.columns, half, memory.two_lines, profiles)
     if _is_examined(memory, 1):
         place = (5 * state.profiles) % (BLOCK_COLUMNS - 2)
         _measure_levels(memory.columns, rows.row[0], half, memory.gate.state, place, scatter.levels)

@@ -148,6 +148,18 @@ def test_a_reflection_near_the_line_is_not_averaged_with_it(apart_px, frequency_
     assert np.all(found.flags[found.period == 2] & MIXED)
 
 
+@pytest.mark.parametrize("apart_px", [-26.0, 25.0])
+def test_a_faint_reflection_near_the_line_is_not_averaged_with_it(apart_px):
+    """The mean of all events is in the line, which is no place to part the two."""
+    camera = Camera(periods=20, half_width_px=4.0, threshold=0.2, events_max=20)
+    reflection = camera.line(lambda k, c: wavy(k, c) + apart_px, power=0.1)
+    found, _ = points(camera, camera.line(wavy), reflection)
+    separate = found.period > 2
+    assert separate.sum() > 0.99 * 17 * 1280, f"seed {camera.seed}"
+    assert np.mean(np.abs(error_px(found)[separate]) > 1.0) < 0.001
+    assert np.all(found.flags[found.period == 2] & MIXED)
+
+
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
 def test_a_line_that_moves_while_it_is_lit_is_one_line(frequency_hz):
     """Its ON events are 20 rows from its OFF events."""
