@@ -284,10 +284,11 @@ def _centre_error_px(footprint):
 
 
 @kernel
-def _compute(footprint, whole, lit_displacement_px):
+def _compute(footprint, whole, lit_displacement_px, limit):
     """Compute the logarithms from the counts of pixels, of ``whole`` lines or of cut ones.
 
-    The lines move by ``lit_displacement_px`` while they are lit.
+    The lines move by ``lit_displacement_px`` while they are lit. Places further than ``limit`` from
+    the centre are as that one.
     """
     pixels, log, none = footprint.pixels, footprint.log, footprint.none
     size = pixels.shape[1]
@@ -316,9 +317,10 @@ def _compute(footprint, whole, lit_displacement_px):
         shares[k] += _PRIOR_PIXELS * overall[k] + _PRIOR_COUNT
     least = max(_LOG_MIN, _LOG_SUM_MIN // (2 * footprint.reach + 3) + 1)
     for b in range(size // 2 + 1):
-        total = shares[:, b].sum()
+        at = max(b, size // 2 - limit)
+        total = shares[:, at].sum()
         for k in range(_COUNTS):
-            share = max(np.rint(_LOG_ONE * np.log(shares[k, b] / total)), least)
+            share = max(np.rint(_LOG_ONE * np.log(shares[k, at] / total)), least)
             if k == 0:
                 none[b] = share
             log[k, b] = share - none[b]
@@ -335,9 +337,10 @@ def _compute(footprint, whole, lit_displacement_px):
 
 
 @kernel(_nrt=True)
-def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px):
+def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px, half):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
+    Those within the windows' ``half`` width count: beyond may be another line, as a reflection.
     Columns in which the sensor's edge cuts the line count where few others are, alone and at the
     distances from their mean rows, which are all off by about as much. Lines move by
     ``lit_displacement_px`` while they are lit.
@@ -347,6 +350,7 @@ def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px):
     whole = 4 * np.count_nonzero(truncated) <= 3 * np.count_nonzero(np.isfinite(row))
     pixels = footprint.pixels
     middle = pixels.shape[1] // 2
+    limit = min(_PLACES * half // FRACTION, middle)
     for slot in range(footprint.first_row.size):
         first_row = footprint.first_row[slot]
         footprint.first_row[slot] = _NOT_SAMPLED
@@ -363,13 +367,13 @@ def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px):
         begin = middle + np.int64(np.rint(_PLACES * (first_row - line)))
         for at in range(np.uintp(first), np.uintp(last + 1)):
             place = begin + np.int64(_PLACES * at)
-            if 0 <= place <= 2 * middle:
+            if abs(place - middle) <= limit:
                 pixels[footprint.rows_seen[slot, at], np.uintp(place)] += 1.0
         state.columns += 1
     state.profiles += 1
     doublings = min(max(state.computations - _ROUNDS, 0), _DOUBLINGS)
     if state.columns >= _COLUMNS_MIN << doublings:
-        _compute(footprint, whole, lit_displacement_px)
+        _compute(footprint, whole, lit_displacement_px, limit)
         state.all_cut = not whole
         # Distances from mean rows do not depend on the footprint.
         pixels *= 0.0 if whole else 0.5

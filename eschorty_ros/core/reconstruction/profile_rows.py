@@ -443,7 +443,14 @@ def _learn_line(memory, half, learns, is_last):
     if learns:
         computations, asymmetric = footprint.state.computations, footprint.state.asymmetric
         lit_displacement_px = memory.light.lit_share * _mean_step_px(history)
-        _learn(footprint, rows, memory.smoothing.row[0], estimator.sensor_rows, lit_displacement_px)
+        _learn(
+            footprint,
+            rows,
+            memory.smoothing.row[0],
+            estimator.sensor_rows,
+            lit_displacement_px,
+            half,
+        )
         counters.footprints += footprint.state.computations - computations
         counters.footprints_asymmetric += footprint.state.asymmetric - asymmetric
     if state.known_half == 0:

@@ -160,6 +160,17 @@ def test_a_faint_reflection_near_the_line_is_not_averaged_with_it(apart_px):
     assert np.all(found.flags[found.period == 2] & MIXED)
 
 
+def test_a_reflection_beside_the_line_does_not_pull_learned_rows():
+    camera = Camera(half_width_px=4.0, threshold=0.2, events_max=20)
+    line = camera.line(wavy)
+    reflection = camera.line(lambda k, c: wavy(k, c) + 25.0, power=0.4)
+    p95_px = []
+    for events in ((line,), (line, reflection)):
+        found, _ = points(camera, *events, centroid="learned")
+        p95_px.append(np.quantile(np.abs(error_px(found)[found.period >= 12]), 0.95))
+    assert p95_px[1] < 1.1 * p95_px[0], f"seed {camera.seed}"
+
+
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
 def test_a_line_that_moves_while_it_is_lit_is_one_line(frequency_hz):
     """Its ON events are 20 rows from its OFF events."""
