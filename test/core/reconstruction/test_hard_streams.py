@@ -136,23 +136,20 @@ def test_a_glint_is_flagged_where_it_hides_the_line_and_else_not_taken_for_it(hi
 
 
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
-@pytest.mark.parametrize("apart_px", [16.0, -22.0])
-def test_a_reflection_near_the_line_is_not_averaged_with_it(apart_px, frequency_hz):
+@pytest.mark.parametrize(
+    ("apart_px", "power", "pixels"),
+    [
+        (16.0, 0.4, {}),
+        (-22.0, 0.4, {}),
+        # The mean of all events is in the line, which is no place to part the two.
+        (-26.0, 0.1, {"threshold": 0.2, "events_max": 20}),
+        (25.0, 0.1, {"threshold": 0.2, "events_max": 20}),
+    ],
+)
+def test_a_reflection_near_the_line_is_not_averaged_with_it(apart_px, power, pixels, frequency_hz):
     """Both are in one window of the widest line that is expected."""
-    camera = Camera(frequency_hz=frequency_hz, periods=20, half_width_px=4.0)
-    reflection = camera.line(lambda k, c: wavy(k, c) + apart_px, power=0.4)
-    found, _ = points(camera, camera.line(wavy), reflection)
-    separate = found.period > 2
-    assert separate.sum() > 0.99 * 17 * 1280, f"seed {camera.seed}"
-    assert np.mean(np.abs(error_px(found)[separate]) > 1.0) < 0.001
-    assert np.all(found.flags[found.period == 2] & MIXED)
-
-
-@pytest.mark.parametrize("apart_px", [-26.0, 25.0])
-def test_a_faint_reflection_near_the_line_is_not_averaged_with_it(apart_px):
-    """The mean of all events is in the line, which is no place to part the two."""
-    camera = Camera(periods=20, half_width_px=4.0, threshold=0.2, events_max=20)
-    reflection = camera.line(lambda k, c: wavy(k, c) + apart_px, power=0.1)
+    camera = Camera(frequency_hz=frequency_hz, periods=20, half_width_px=4.0, **pixels)
+    reflection = camera.line(lambda k, c: wavy(k, c) + apart_px, power=power)
     found, _ = points(camera, camera.line(wavy), reflection)
     separate = found.period > 2
     assert separate.sum() > 0.99 * 17 * 1280, f"seed {camera.seed}"
