@@ -106,7 +106,7 @@ def command(
         if is_yaml(out):
             check_output(out)
         else:
-            check_picture(out, others=".yaml, ")
+            check_picture(out, others=(".yaml",))
     if far_mm is not None:
         build = design_for_ranges(far_mm=far_mm, **given)
     else:

@@ -28,7 +28,7 @@ def is_yaml(path: Path) -> bool:
     return path.suffix.lower() in (".yaml", ".yml")
 
 
-def check_picture(out: Path, *inputs: Path, others: str = "") -> None:
+def check_picture(out: Path, *inputs: Path, others: tuple[str, ...] = ()) -> None:
     """Refuse a picture that cannot be written, or whose extension names no form of one.
 
     - ``others``: Extensions that the command also writes, for the message.
@@ -36,7 +36,8 @@ def check_picture(out: Path, *inputs: Path, others: str = "") -> None:
     from matplotlib.backend_bases import FigureCanvasBase
 
     if out.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
-        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose {others}.png, .pdf or .svg")
+        known = ", ".join((*others, ".png", ".pdf"))
+        raise ArgumentError(f"{out} ends in {out.suffix!r}; choose {known} or .svg")
     check_output(out, *inputs)
 
 

@@ -281,7 +281,7 @@ class LaserSupervisor:
                         self._outbox.popleft()()
                     except Exception as error:
                         # It must end neither a watchdog nor a command.
-                        self._log(f"laser: its state was not published: {error!r}")
+                        self._log(f"laser: a report of it failed: {error!r}")
             finally:
                 self._sending.release()
 

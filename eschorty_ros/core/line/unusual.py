@@ -258,7 +258,7 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
 
 @kernel
 def _moved_median(median, value, values):
-    """Return the running median of ``values`` in number, moved towards the last one, ``value``."""
+    """Return the running median, moved towards ``value``, the last of this many ``values``."""
     step = max(1.0 / values, _STEP)
     if median == 0.0:
         return (1.0 - step) * value

@@ -266,6 +266,7 @@ class AptLink:
                     self._queued.wait(self._idle_s())
 
     def _idle_s(self) -> float:
+        """Return the time to the next action."""
         now_ns = self.now_ns()
         due_ns = min((timer.due_ns for timer in self._timers), default=now_ns + 10**9)
         return max(due_ns - now_ns, 0) * 1e-9

@@ -109,7 +109,7 @@ class Reports:
         return diagnostics.OK, "reconstructing", values
 
     def _new_losses(self) -> list[str]:
-        """Return a line for each loss since the last call."""
+        """Return a line for each loss since the last call; log that of points."""
         placer = self._pipeline.placer
         lost = self._pipeline.stream.packets_lost, placer.points_without_stage
         before, self._lost_reported = self._lost_reported, lost
