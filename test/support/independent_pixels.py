@@ -60,11 +60,12 @@ class Camera:
         self,
         row: Callable[[int, NDArray[Any]], NDArray[Any]],
         power: float = 1.0,
-        part: Callable[[int], tuple[float, float]] = lambda _: (-ROWS, ROWS),
+        part: Callable[[int, NDArray[Any]], tuple[Any, Any]] = lambda _, __: (-ROWS, ROWS),
     ) -> Events:
         """Return the events of a line at ``row(period, columns)``; NaN is dark.
 
-        Only the ``part`` of its thickness, rows from its centre, falls on this surface.
+        Only the ``part(period, columns)`` of its thickness, rows from its centre, falls on this
+        surface.
         """
         column = np.arange(COLUMNS)
         reach = max(REACH, round(2.4 * self.half_width_px))
@@ -77,7 +78,7 @@ class Camera:
             x = np.broadcast_to(column, y.shape)
             seen = lit & (y >= 0) & (y < ROWS)
             y, x, centre = y[seen], x[seen], np.broadcast_to(true_row, y.shape)[seen]
-            low, high = part(k)
+            low, high = part(k, x)
             inside = (y - centre >= low) & (y - centre < high)
             brighter = self.contrast * power * self.light(y - centre) * inside
             swing = np.log1p(brighter)

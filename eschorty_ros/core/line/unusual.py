@@ -51,8 +51,8 @@ _PROFILES_KEPT = 256
 _PROFILES_KNOWN = 16
 # Steps of the running median of differences are this share of it, larger ones at first.
 _STEP = 1.0 / 1024.0
-# Standard deviation over the median size of differences.
-_SIGMA_PER_MEDIAN = 1.0 / 0.954
+# Standard deviation over the median size of second differences.
+_SIGMA_PER_MEDIAN = 1.0 / 1.652
 # Columns to either side that move as a column does.
 _BESIDE = BLOCK_COLUMNS + BLOCK_COLUMNS // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
@@ -61,7 +61,7 @@ _MARKED = 2.5
 
 
 class UsualWidths(NamedTuple):
-    """Points by width, and medians of the ``width`` and of the ``difference`` of near widths."""
+    """Points by width, and medians of the ``width`` and of second ``difference`` of near widths."""
 
     number: NDArray[np.float64]
     median: Any
@@ -350,7 +350,7 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
     known = _is_known(widths)
     usual, median = widths.usual.median.width, widths.usual.median.difference
     sigma = _SIGMA_PER_MEDIAN * median
-    pairs = widths.below[_BINS] + 1.0
+    bends = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
@@ -381,9 +381,11 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
             rows.mixed[k, c] = edge2 > limit2
             passing2 = _passing_variance(widths, history.passing2[block], k, c, sigma)
             sigma2[k, c] += max(edge2, passing2)
-            if c >= APART and not np.isnan(smoothed[k, c - APART]):
-                pairs += 1.0
-                median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
+            if c >= 2 * APART:
+                bend = smoothed[k, c] - 2.0 * smoothed[k, c - APART] + smoothed[k, c - 2 * APART]
+                if not np.isnan(bend):
+                    bends += 1.0
+                    median = _moved_median(median, abs(bend), bends)
     for k in range(returns):
         for c in range(np.uintp(columns)):
             last[k, c], last_row[k, c] = widths.static_width[k, c], row[k, c]

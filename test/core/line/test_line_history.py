@@ -81,7 +81,7 @@ def test_lines_that_appear_and_vanish_are_flagged(speed_px, pitch, least, most, 
     """Surfaces with nothing between, half of the points at an edge: all widths are usual."""
     camera = Camera(periods=4 * pitch + 80)
 
-    def part(k):
+    def part(k, _):
         # What is ahead of the surface's first edge or behind its last one is not lit.
         return speed_px * (0.25 * pitch - k % pitch), speed_px * (0.75 * pitch - k % pitch)
 

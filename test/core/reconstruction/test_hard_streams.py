@@ -61,8 +61,8 @@ def _beside_a_step(camera: Camera, rows: float) -> tuple[Profiles, np.ndarray, n
         """Return where the step is in the line, rows from its centre."""
         return (camera.periods // 2 - k) * 0.16 * camera.half_width_px
 
-    near = camera.line(wavy, part=lambda k: (-28.0, step(k)))
-    far = camera.line(lambda k, c: wavy(k, c) + rows, part=lambda k: (step(k), 28.0))
+    near = camera.line(wavy, part=lambda k, _: (-28.0, step(k)))
+    far = camera.line(lambda k, c: wavy(k, c) + rows, part=lambda k, _: (step(k), 28.0))
     found, _ = points(camera, near, far)
     found = found.select(found.period >= 4)
     away_px = step(found.period)
