@@ -61,10 +61,10 @@ _MARKED = 2.5
 
 
 class UsualWidths(NamedTuple):
-    """Points by width, and medians of the ``width`` and of second ``difference`` of near widths."""
+    """Points by width; the ``typical`` ones are medians of widths and of second differences."""
 
     number: NDArray[np.float64]
-    median: Any
+    typical: Any
 
 
 class Widths(NamedTuple):
@@ -104,7 +104,7 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
 
 def empty_usual_widths() -> UsualWidths:
     """Return no usual widths."""
-    return UsualWidths(np.zeros(_BINS), record("width", "difference", value=0.0))
+    return UsualWidths(np.zeros(_BINS), record("median", "difference", value=0.0))
 
 
 @kernel
@@ -117,7 +117,7 @@ def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles."""
     points, usual = _PROFILES_KNOWN * widths.last.shape[1], widths.usual
     known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
-    known.median.difference = usual.median.difference
+    known.typical.difference = usual.typical.difference
 
 
 @kernel
@@ -133,14 +133,14 @@ def _update(widths, columns):
     median = 0
     while median < _BINS - 1 and 2.0 * below[median + 1] < total:
         median += 1
-    widths.usual.median.width = (median + 0.5) / _PER_ROW
+    widths.usual.typical.median = (median + 0.5) / _PER_ROW
 
 
 @kernel
 def _restart_widths(widths, known):
     """Clear all widths but the ``known`` ones, zeros where there are none."""
     widths.usual.number[:] = known.number
-    widths.usual.median.difference = known.median.difference
+    widths.usual.typical.difference = known.typical.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
     widths.below[:] = 0.0
@@ -230,11 +230,11 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
 
     Weak points show no width.
     """
-    row, static_width, median = smoothing.row, widths.static_width, widths.usual.median
+    row, static_width, typical = smoothing.row, widths.static_width, widths.usual.typical
     now = history.now
     returns, columns = row.shape
     known = _is_known(widths)
-    usual = median.width if known else np.inf
+    usual = typical.median if known else np.inf
     for k in range(returns):
         _without_motion(
             smoothing.width[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
@@ -252,8 +252,8 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
                 points += 1.0
         now.row[block], now.width[block] = total, width
         now.sigma2[block], now.points[block] = sigma2, points
-    sigma = _SIGMA_PER_MEDIAN * median.difference
-    _compare_with_recent(history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
+    sigma = _SIGMA_PER_MEDIAN * typical.difference
+    _compare_with_recent(history, known, typical.median, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel
@@ -275,7 +275,7 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
     was steady or, where it has not been so yet, since the last profile. Half of that, to twice,
     counts, as rows and widths are smoothed differently. Else the variance is 0.
     """
-    width, usual = widths.static_width[k, c], widths.usual.median.width
+    width, usual = widths.static_width[k, c], widths.usual.typical.median
     same_width, same = widths.same_width, widths.same
     moved = abs(row - widths.last_row[k, c])
     if moved > width:
@@ -306,7 +306,7 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     if passing2 == 0.0:
         return 0.0
     width, steady = widths.static_width[k, c], widths.steady[k, c]
-    apart = abs(width - widths.usual.median.width)
+    apart = abs(width - widths.usual.typical.median)
     if not np.isnan(steady):
         apart = max(apart, abs(width - steady))
     return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
@@ -337,7 +337,7 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
-    return max(edge2, _unusual_variance(width, widths.usual.median.width)), weight
+    return max(edge2, _unusual_variance(width, widths.usual.typical.median)), weight
 
 
 @kernel(_nrt=False)
@@ -348,8 +348,8 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
     returns, columns = row.shape
     last, last_row = widths.last, widths.last_row
     known = _is_known(widths)
-    usual, median = widths.usual.median.width, widths.usual.median.difference
-    sigma = _SIGMA_PER_MEDIAN * median
+    usual, difference = widths.usual.typical.median, widths.usual.typical.difference
+    sigma = _SIGMA_PER_MEDIAN * difference
     bends = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
@@ -385,9 +385,9 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
                 bend = smoothed[k, c] - 2.0 * smoothed[k, c - APART] + smoothed[k, c - 2 * APART]
                 if not np.isnan(bend):
                     bends += 1.0
-                    median = _moved_median(median, abs(bend), bends)
+                    difference = _moved_median(difference, abs(bend), bends)
     for k in range(returns):
         for c in range(np.uintp(columns)):
             last[k, c], last_row[k, c] = widths.static_width[k, c], row[k, c]
-    widths.usual.median.difference = median
+    widths.usual.typical.difference = difference
     _update(widths, columns)

@@ -124,7 +124,7 @@ class ProfileAssembler:
         self._memory.footprint.state["near_edge"] = 0
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
         self._memory.known_widths.number[:] = 0.0
-        self._memory.known_widths.median["difference"] = 0.0
+        self._memory.known_widths.typical["difference"] = 0.0
         _end(self._boxed_memory)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
