@@ -4,7 +4,7 @@ An edge of range or reflectance within the line's thickness leaves a part of the
 side by side, and moves the row by up to half of the change of the full width. A width is unusual
 when few lines of the stream have it for longer than a profile: the width of a line that a step
 crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
-one that changes is compared with the last that was steady, or else with the median of all. An edge
+one that changes is compared with the last that was steady, or else with the mode of all. An edge
 leaves one end of the line where it is: where the row does not move with the width, the light has
 changed.
 
@@ -61,7 +61,7 @@ _MARKED = 2.5
 
 
 class UsualWidths(NamedTuple):
-    """Points by width; the ``typical`` ones are medians of widths and of second differences."""
+    """Points by width; ``typical`` are median and mode, and the median of second differences."""
 
     number: NDArray[np.float64]
     typical: Any
@@ -104,7 +104,7 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
 
 def empty_usual_widths() -> UsualWidths:
     """Return no usual widths."""
-    return UsualWidths(np.zeros(_BINS), record("median", "difference", value=0.0))
+    return UsualWidths(np.zeros(_BINS), record("median", "mode", "difference", value=0.0))
 
 
 @kernel
@@ -121,8 +121,29 @@ def _keep_widths(widths, known):
 
 
 @kernel
+def _reach(columns, sigma):
+    """Return the standard deviation, in bins, of a width that is a mean of this many ``columns``.
+
+    ``sigma`` is that of the mean of `WIDTH_COLUMNS`, px.
+    """
+    share = WIDTH_COLUMNS / min(columns, WIDTH_COLUMNS)
+    return np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
+
+
+@kernel(inline="always")
+def _near(below, place, reach):
+    """Return the number of points whose widths are this many bins from ``place`` at most."""
+    return below[min(place + reach + 1, _BINS)] - below[max(place - reach, 0)]
+
+
+@kernel
 def _update(widths, columns):
-    """Bring the sums and the median up to date; halve the numbers when there are many points."""
+    """Bring the sums and typical widths up to date; halve the numbers when there are many points.
+
+    Where edges or stripes make widths many, the median may be that of no line: the mode is the
+    width that most points have, within one standard deviation.
+    """
+    typical = widths.usual.typical
     number, below = widths.usual.number, widths.below
     if below[_BINS] > _PROFILES_KEPT * columns:
         number *= 0.5
@@ -133,7 +154,13 @@ def _update(widths, columns):
     median = 0
     while median < _BINS - 1 and 2.0 * below[median + 1] < total:
         median += 1
-    widths.usual.typical.median = (median + 0.5) / _PER_ROW
+    reach = _reach(WIDTH_COLUMNS, _SIGMA_PER_MEDIAN * typical.difference)
+    mode, most = 0, 0.0
+    for b in range(_BINS):
+        near = _near(below, b, reach)
+        if near > most:
+            mode, most = b, near
+    typical.median, typical.mode = (median + 0.5) / _PER_ROW, (mode + 0.5) / _PER_ROW
 
 
 @kernel
@@ -155,9 +182,7 @@ def _is_known(widths):
 
 @kernel(_nrt=False)
 def _is_usual(below, width, reach):
-    place = _width_bin(width)
-    low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
-    return below[high] - below[low] >= _USUAL_SHARE * below[_BINS]
+    return _near(below, _width_bin(width), reach) >= _USUAL_SHARE * below[_BINS]
 
 
 @kernel
@@ -275,7 +300,7 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
     was steady or, where it has not been so yet, since the last profile. Half of that, to twice,
     counts, as rows and widths are smoothed differently. Else the variance is 0.
     """
-    width, usual = widths.static_width[k, c], widths.usual.typical.median
+    width, usual = widths.static_width[k, c], widths.usual.typical.mode
     same_width, same = widths.same_width, widths.same
     moved = abs(row - widths.last_row[k, c])
     if moved > width:
@@ -312,16 +337,6 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
 
 
-@kernel
-def _reach(columns, sigma):
-    """Return the standard deviation, in bins, of a width that is a mean of this many ``columns``.
-
-    ``sigma`` is that of the mean of `WIDTH_COLUMNS`, px.
-    """
-    share = WIDTH_COLUMNS / min(columns, WIDTH_COLUMNS)
-    return np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
-
-
 @kernel(_nrt=False)
 def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     """Return the variance of a row at an edge, px squared, and the weight of its line's width.
@@ -337,7 +352,7 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
-    return max(edge2, _unusual_variance(width, widths.usual.typical.median)), weight
+    return max(edge2, _unusual_variance(width, widths.usual.typical.mode)), weight
 
 
 @kernel(_nrt=False)
