@@ -6,7 +6,7 @@ when few lines of the stream have it for longer than a profile: the width of a l
 crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
 one that changes is compared with the last that was steady, or else with the mode of all. An edge
 leaves one end of the line where it is: where the row does not move with the width, the light has
-changed.
+changed. Row and width change together from column to column, too, where an edge is oblique.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
@@ -216,6 +216,24 @@ def _mixed_variance(rows, smoothing, k, c, sigma_width):
     return mixed2 if wider and 2.0 * (variance - beside * beside) > mixed2 else 0.0
 
 
+@kernel(_nrt=False)
+def _oblique_variance(smoothing, widths, k, c, sigma_width):
+    """Return the variance of a row at an edge that is oblique to the line, px squared, else 0.
+
+    Such an edge leaves more of the line from column to column, and one end where it is: row and
+    width change together.
+    """
+    before, after = c - APART, c + APART
+    if before < 0 or after >= smoothing.row.shape[1]:
+        return 0.0
+    width, missing = widths.static_width, widths.usual.typical.mode - widths.static_width[k, c]
+    wider = abs(width[k, after] - width[k, before])
+    moved = abs(smoothing.row[k, after] - smoothing.row[k, before])
+    at_edge = 0.5 * PER_WIDTH * wider < moved < 2.0 * PER_WIDTH * wider
+    unlike = min(missing, wider) > STEADY * sigma_width
+    return (PER_WIDTH * missing) ** 2 if unlike and at_edge else 0.0
+
+
 @kernel
 def _static_width(width, usual, displacement):
     """Return the width of a line less what its ``displacement`` while it is lit may add.
@@ -349,6 +367,7 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     if not known:
         return edge2, 1.0
     edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, np.sqrt(WIDTH_COLUMNS) * sigma))
+    edge2 = max(edge2, _oblique_variance(smoothing, widths, k, c, sigma))
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT

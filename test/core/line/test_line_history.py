@@ -51,7 +51,7 @@ def test_sigma_holds_what_the_edges_of_stripes_move():
         return speed_px * ((k - stripe // 2) % stripe - stripe // 2)
 
     def part(bright):
-        def rows(k):
+        def rows(k, _):
             ahead_is_bright = (k + stripe // 2) // stripe % 2 == 0
             return (-ROWS, edge_px(k)) if bright == ahead_is_bright else (edge_px(k), ROWS)
 
@@ -114,8 +114,8 @@ def test_sigma_holds_what_an_edge_too_small_for_a_flag_moves(step_px):
     def line(step, part):
         return camera.line(lambda _, column: np.full(column.shape, ROW + step), part=part)
 
-    behind = line(0.0, lambda k: (edge_px(k), ROWS))
-    ahead = line(step_px, lambda k: (-ROWS, edge_px(k)))
+    behind = line(0.0, lambda k, _: (edge_px(k), ROWS))
+    ahead = line(step_px, lambda k, _: (-ROWS, edge_px(k)))
     found, _ = reconstruct(stream(behind, ahead))
     passing = (found.period > first) & (found.period < last)
     error_px = found.row - np.where(found.period < middle, ROW, ROW + step_px)

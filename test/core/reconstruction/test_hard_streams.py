@@ -117,6 +117,25 @@ def test_columns_with_light_of_two_surfaces_are_flagged_where_a_stream_has_many(
     assert np.mean(error < 2.0 * found.sigma_row) > 0.95
 
 
+@pytest.mark.parametrize(("rows_per_column", "least"), [(0.2, 0.7), (0.4, 0.95)])
+def test_points_beside_oblique_edges_are_flagged_where_a_stream_has_many(rows_per_column, least):
+    """Triangles before a distant wall: in time nothing changes, and all widths are usual."""
+    camera = Camera(periods=30)
+
+    def part(_, column):
+        return -28.0, (column % 160 - 80.0) * rows_per_column
+
+    found, _ = points(camera, camera.line(wavy, part=part))
+    found = found.select(found.period >= 8)
+    error, flagged = np.abs(error_mm(found)), found.flags > 0
+    wrong, right = error > 2.2, error < 1.0
+    print(f"flagged: {flagged[wrong].mean():.3f}, of the right ones {flagged[right].mean():.3f}")
+    assert wrong.mean() > 0.2, f"seed {camera.seed}"
+    # 0.29 and 0.41 of them by widths in time alone.
+    assert flagged[wrong].mean() > least
+    assert flagged[right].mean() < 0.04
+
+
 @pytest.mark.parametrize("hides", [False, True])
 def test_a_glint_is_flagged_where_it_hides_the_line_and_else_not_taken_for_it(hides):
     """It is broader than the line, and so may be a line that moves; columns beside it do not."""

@@ -97,8 +97,8 @@ def test_steps_of_other_pixels_are_corrected_however_the_camera_is_mounted(profi
         """Return where the step is in the line, rows from its centre."""
         return 1.6 * profile(k)
 
-    dark = camera.line(wavy, 0.08, lambda k: (-30.0, edge(k)))
-    bright = camera.line(wavy, 1.0, lambda k: (edge(k), 30.0))
+    dark = camera.line(wavy, 0.08, lambda k, _: (-30.0, edge(k)))
+    bright = camera.line(wavy, 1.0, lambda k, _: (edge(k), 30.0))
     modulation = Modulation(70.0, on_edge_us=FIRST_EDGE_US)
     rms = {}
     for switch in ("off", "on"):
