@@ -11,6 +11,7 @@ from eschorty_ros.core.evt3 import Counters
 # Chance gives up to 0.18 of the points of short streams a shift.
 _BURST_SHIFT_SHARE = 0.22
 _RATE_CONTROL_SHARE = 0.01
+_OVER_LIMIT_SHARE = 0.01
 # Words that a stream which begins anywhere, or goes on after a gap, may break.
 _BROKEN_PER_GAP = 10
 _TIME_FAULTS = {
@@ -71,8 +72,15 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         found.append(
             f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
         )
+    over = counts["events_over_column_limit"] / max(counts["events"], 1)
     share = counts["points_burst_shift"] / max(counts["points_followed"], 1)
-    if 2 * counts["points_one_polarity"] > counts["points_followed"]:
+    if over > _OVER_LIMIT_SHARE:
+        # The last events of a profile miss, which the following lines would ascribe to the camera.
+        found.append(
+            f"column_limit drops {over:.0%} of the events, the last ones of a profile; raise it, "
+            "lower periods_per_profile, or let the camera send fewer events"
+        )
+    elif 2 * counts["points_one_polarity"] > counts["points_followed"]:
         found.append(
             "the line has events of one polarity alone: where it moves, its rows are ahead (ON) or "
             "behind (OFF) by up to its width, and sigma has its displacement per profile only; let "

@@ -311,6 +311,8 @@ def test_events_over_the_column_limit_are_counted():
         for n in np.bincount(events[1][(events[0] - 1000) // 14286 == k])
     )
     assert reconstructor.counters["events_over_column_limit"] == pytest.approx(expected, rel=0.01)
+    (warning,) = reconstructor.warnings
+    assert "column_limit drops 36% of the events, the last ones of a profile; raise it" in warning
 
 
 def test_jittered_and_missing_triggers_lose_no_event():
