@@ -53,7 +53,7 @@ _CHANNELS = ("row", "width", "spacing")
 _MISFIT_PX = 10.0
 # Correlation of rows with range beyond which their sense is no error of some.
 _MIRRORED = 0.9
-# Times that a range may be outside those of the design: metres among millimetres are farther.
+# Times that a range may be outside those of the design: metres and micrometres are farther.
 _OTHER_UNIT = 50.0
 
 
@@ -230,11 +230,11 @@ def _priors(
 
 
 def _refuse_units(targets: Targets, design: RangeModel) -> None:
-    """Refuse some ranges in another unit than the others; all alike have a line of their own."""
+    """Refuse ranges in another unit."""
     near_mm, far_mm = design.range_limits_mm
     small, large = targets.range_mm < near_mm / _OTHER_UNIT, targets.range_mm > far_mm * _OTHER_UNIT
     wrong = np.flatnonzero(small | large)
-    if 0 < wrong.size < len(targets):
+    if wrong.size:
         raise ArgumentError(
             f"range_mm of target {targets.labels[wrong[0]]} is {targets.range_mm[wrong[0]]:g}; "
             f"give millimetres, {near_mm:.0f} to {far_mm:.0f} by the design"

@@ -215,7 +215,10 @@ def test_a_refusal_names_what_is_wrong():
     for share in (0.001, 1 / 25.4, 0.5):
         wrong = given(size_mm=TWO_SIZES_MM * share)
         refused(FitError, wrong, match="check width_px and size_mm")
-    for share in (0.001, 1 / 25.4, 0.1):
+    for share in (1e-3, 1e3, 1e6):
+        wrong = Targets(targets.row, targets.range_mm * share, sigma_range_mm=1.0)
+        refused(ArgumentError, wrong, match="target 1 is .*give millimetres, 785 to 2116")
+    for share in (1 / 25.4, 0.1):
         wrong = Targets(targets.row, targets.range_mm * share, sigma_range_mm=1.0)
         refused(FitError, wrong, match="give range_mm in millimetres, 785 to 2116")
     same, free = given(column=640.0), ("k_prime_px", "b_prime_px", "b_prime_1_px")
