@@ -15,7 +15,7 @@ from eschorty_ros.cli.files import (
     is_yaml,
     report_replaced,
 )
-from eschorty_ros.cli.options import Number, refuse_given
+from eschorty_ros.cli.options import Integer, Number, refuse_given
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,9 +50,7 @@ _LIGHT_S = 0.5 / 70.0
 @click.option(
     "--b-mm", type=Number(), default=0.0, show_default=True, help="Datum to focal line, mm."
 )
-@click.option(
-    "--ranges", type=click.IntRange(2, 100), default=8, show_default=True, help="Table rows."
-)
+@click.option("--ranges", type=Integer(2, 100), default=8, show_default=True, help="Table rows.")
 @click.option(
     "--pixel-um", type=Number(), default=4.86, show_default=True, help="Pixel pitch of the sensor."
 )

@@ -16,13 +16,26 @@ SWEEP_MAX_MM = 1000.0
 """Longer than any stage that scans; a recording of it would fill a disk."""
 
 
-class Number(click.FloatRange):
-    """A finite number, within bounds if they are given."""
+class Integer(click.IntRange):
+    """A whole number within bounds, which help and messages give with their ``unit``."""
 
-    name = "number"
+    name = "integer"
+    unit = ""
 
     def _describe_range(self) -> str:
-        return "" if self.min is None and self.max is None else super()._describe_range()
+        return f"{super()._describe_range()} {self.unit}".rstrip()
+
+
+class Number(click.FloatRange):
+    """A finite number, within bounds if they are given, with their ``unit``."""
+
+    name = "number"
+    unit = ""
+
+    def _describe_range(self) -> str:
+        if self.min is None and self.max is None:
+            return ""
+        return f"{super()._describe_range()} {self.unit}".rstrip()
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number; refuse NaN and infinity."""
@@ -93,9 +106,7 @@ _SWEEP = (
         help="ambient, falloff_mm, defocus_mm, ghost and ghost_mm, occlusion, row_time_us: what "
         "the simulated world leaves out otherwise; docs/accuracy.md.",
     ),
-    click.option(
-        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed."
-    ),
+    click.option("--seed", type=Integer(0), default=0, show_default=True, help="Noise seed."),
 )
 
 
@@ -156,7 +167,7 @@ def check_sweep(start_mm: float, stop_mm: float) -> None:
 def page_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the address of a page in the browser to a command."""
     port = click.option(
-        "--port", type=click.IntRange(1, 65535), default=8080, show_default=True,
+        "--port", type=Integer(1, 65535), default=8080, show_default=True,
         help="Port of the page.",
     )  # fmt: skip
     host = click.option(

@@ -17,7 +17,7 @@ from eschorty_ros.cli.console import accuracy_rows, of_total, pairs, progress_ba
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import Number, recorded_options, refuse_given, stated
+from eschorty_ros.cli.options import Integer, Number, recorded_options, refuse_given, stated
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -42,22 +42,21 @@ def setting_options() -> list[click.Parameter]:
     options: list[click.Parameter] = []
     for item in fields(Settings):
         meta = item.metadata
-        kind: click.ParamType
+        kind: click.Choice[str] | Integer | Number
         if "choices" in meta:
             kind = click.Choice(meta["choices"])
-        elif isinstance(item.default, int):
-            low, high = meta["range"]
-            kind = click.IntRange(int(low), int(high))
         else:
-            kind = Number(*meta["range"])
-        unit = f" ({meta['unit']})" if meta["unit"] else ""
+            low, high = meta["range"]
+            whole = isinstance(item.default, int)
+            kind = Integer(int(low), int(high)) if whole else Number(low, high)
+            kind.unit = meta["unit"]
         options.append(
             click.Option(
                 [f"--{item.name.replace('_', '-')}", item.name],
                 type=kind,
                 default=item.default,
                 show_default=True,
-                help=meta["description"] + unit,
+                help=meta["description"],
             )
         )
     return options
@@ -76,7 +75,7 @@ def setting_options() -> list[click.Parameter]:
     type=OUT_FILE,
     help="Cloud to write, .pcd or .ply, of one recording.  [default: RECORDING/cloud.pcd]",
 )
-@click.option("--jobs", type=click.IntRange(1, 256), help="Threads.  [default: one per core]")
+@click.option("--jobs", type=Integer(1, 256), help="Threads.  [default: one per core]")
 @click.option(
     "--dask",
     metavar="ADDRESS",

@@ -13,7 +13,14 @@ import click
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, report_replaced
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, stated, sweep_options
+from eschorty_ros.cli.options import (
+    Integer,
+    check_sweep,
+    page_options,
+    refuse_given,
+    stated,
+    sweep_options,
+)
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.live.sweep_coverage import PASSES_MAX
 
@@ -48,7 +55,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--passes",
-    type=click.IntRange(1, PASSES_MAX),
+    type=Integer(1, PASSES_MAX),
     default=1,
     show_default=True,
     help="Sweeps, every second one back; their points are joined.",

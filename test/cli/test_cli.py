@@ -136,6 +136,18 @@ def test_wrong_usage_is_exit_code_2(arguments):
     assert "Traceback" not in result.output
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--range-min", "1200", "0.0<=x<=1000.0 m."),
+        ("--column-first", "5000", "0<=x<=2047 columns."),
+        ("--jobs", "many", "'many' is not a valid integer."),
+    ],
+)
+def test_a_refused_number_names_its_unit_and_kind(option, value, words):
+    assert words in run("reconstruct", "rec", option, value).output
+
+
 def test_a_stated_failure_is_one_line_on_stderr_and_exit_code_1(tmp_path):
     assert_fails_in_one_line(run("reconstruct", tmp_path), "events.raw")
 
