@@ -193,10 +193,10 @@ class PixelArray:
         - ``t_us``: Must not fall from call to call.
         - ``columns``: Shape (n,).
         - ``line_row``, ``reflectance``: Shape (n,) or (n, patches), as all that follow. A row that
-          is NaN or a reflectance of 0 leaves the column unlit. With several patches the footprint
+          is NaN or a reflectance of 0 leaves the column unlit. With several patches the line
           has parts on different surfaces.
         - ``low_row``, ``high_row``: Rows between which a patch is lit (edges between rows, so
-          ``y - 0.5`` to ``y + 0.5`` is one row); the complete footprint when left out.
+          ``y - 0.5`` to ``y + 0.5`` is one row); the complete line when left out.
         - ``sigma_rows``: Gaussian width of each patch, that of the parameters when left out.
 
         Raises ``ArgumentError`` for a reflectance outside 0 to 1.

@@ -1,7 +1,7 @@
 """Scene, laser, stage and pixels over sensor time: bytes out, with the truth known."""
 
 from eschorty_ros.simulation.world.effects import Effects
-from eschorty_ros.simulation.world.footprint import footprint
+from eschorty_ros.simulation.world.line_on_scene import line_on_scene
 from eschorty_ros.simulation.world.recorder import simulate_recording
 from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, SensorControl, StageTimeline
 from eschorty_ros.simulation.world.warm_up import warm_up
@@ -16,7 +16,7 @@ __all__ = [
     "SensorControl",
     "StageTimeline",
     "World",
-    "footprint",
+    "line_on_scene",
     "simulate_recording",
     "warm_up",
 ]

@@ -12,7 +12,7 @@ from eschorty_ros.core.optics import Calibration
 from eschorty_ros.simulation.pixels import PixelArray
 from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.effects import Effects
-from eschorty_ros.simulation.world.footprint import footprint
+from eschorty_ros.simulation.world.line_on_scene import line_on_scene
 from eschorty_ros.simulation.world.off_sheet import off_sheet
 
 _ROW_STEP = 0.02
@@ -68,7 +68,7 @@ class DrawnLine:
 
     def _draw_at(self, t_us: int, position_mm: float) -> None:
         half_rows = self._pixels.parameters.half_width_rows
-        seen = footprint(self._scene, self._model, position_mm, half_rows)
+        seen = line_on_scene(self._scene, self._model, position_mm, half_rows)
         moved = ~(np.abs(seen.row - self._row) <= _ROW_STEP)
         moved &= ~(np.isnan(seen.row) & np.isnan(self._row))
         with np.errstate(invalid="ignore"):

@@ -10,7 +10,7 @@ from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.simulation.scenes import Plane, Sphere, named
-from eschorty_ros.simulation.world import World, footprint
+from eschorty_ros.simulation.world import World, line_on_scene
 
 SEED = 2
 CALIBRATION = replace(load_calibration("config_3"), columns=48, principal_column=23.5)
@@ -49,7 +49,7 @@ def rows_seen(scene) -> np.ndarray:
 @pytest.mark.parametrize("ahead_mm", [-1.5, -0.3, 0.4, 2.0])
 def test_a_reflectance_edge_lies_where_the_geometry_puts_it(ahead_mm: float) -> None:
     scene = Edge(50.0, reflectances=(0.3, 1.0))
-    seen = footprint(scene, MODEL, 50.0 - ahead_mm, HALF_ROWS)
+    seen = line_on_scene(scene, MODEL, 50.0 - ahead_mm, HALF_ROWS)
     row = float(MODEL.row(1320.0))
     assert seen.split.tolist() == list(range(48))
     border = row - ahead_mm * float(MODEL.rows_per_mm_off_sheet(1320.0))
@@ -65,11 +65,11 @@ def test_a_reflectance_edge_lies_where_the_geometry_puts_it(ahead_mm: float) -> 
 def test_smooth_surfaces_have_one_patch() -> None:
     for scene in (Plane(), named("tilted"), Plane(1320.0, 1.5, 0.5)):
         for stage_mm in (0.0, 33.3, 100.0):
-            seen = footprint(scene, MODEL, stage_mm, HALF_ROWS)
+            seen = line_on_scene(scene, MODEL, stage_mm, HALF_ROWS)
             assert seen.split.size == 0
             here = scene.range_mm([stage_mm], np.arange(48), MODEL)[0]
             assert np.array_equal(seen.row, MODEL.row(here))
-    over_the_top = footprint(Sphere(1320.0, 50.0), MODEL, 50.0, HALF_ROWS)
+    over_the_top = line_on_scene(Sphere(1320.0, 50.0), MODEL, 50.0, HALF_ROWS)
     assert over_the_top.split.size == 0
 
 
@@ -77,10 +77,10 @@ def test_the_end_of_a_scene_cuts_the_line() -> None:
     scene = Edge(50.0, ranges_mm=(1320.0, np.nan))
     row = float(MODEL.row(1320.0))
     per_mm = float(MODEL.rows_per_mm_off_sheet(1320.0))
-    inside = footprint(scene, MODEL, 49.0, HALF_ROWS)
+    inside = line_on_scene(scene, MODEL, 49.0, HALF_ROWS)
     assert np.allclose(inside.low_row[:, 0], row - per_mm, atol=0.25)
     assert not inside.patch_reflectance[:, 1].any()
-    outside = footprint(scene, MODEL, 51.0, HALF_ROWS)
+    outside = line_on_scene(scene, MODEL, 51.0, HALF_ROWS)
     assert np.isnan(outside.row).all()
     assert np.allclose(outside.patch_row[:, 1], row)
     assert np.allclose(outside.low_row[:, 1], row + per_mm, atol=0.25)

@@ -13,7 +13,7 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes import Scene
 
 _SAMPLES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-"""Samples of the scene across the line, in half widths of the footprint."""
+"""Samples of the scene across the line, in its half widths."""
 _CENTRE = 2
 _FINE = 32
 """Parts into which the interval between two samples is divided to find an edge."""
@@ -22,7 +22,7 @@ _REFLECTANCE_JUMP = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Footprint:
+class LineOnScene:
     """The line on the scene at one stage position."""
 
     row: Array
@@ -30,7 +30,7 @@ class Footprint:
     """Row of the middle of the line and reflectance there, shape (columns,); NaN where it hits
     nothing."""
     split: NDArray[np.int64]
-    """Columns across whose footprint an edge runs, shape (n,)."""
+    """Columns in which an edge is within the thickness of the line, shape (n,)."""
     patch_row: Array
     patch_reflectance: Array
     low_row: Array
@@ -39,7 +39,9 @@ class Footprint:
     :meth:`PixelArray.relight`."""
 
 
-def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float) -> Footprint:
+def line_on_scene(
+    scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
+) -> LineOnScene:
     """Return the line on the scene across its thickness.
 
     Rows ``d`` above the line's centre image the scene ``d / rows_per_mm_off_sheet`` behind the
@@ -84,7 +86,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     below = ahead != middle
     dark = np.isnan(patch_row)
     patch_reflectance = np.column_stack((here_reflectance, there_reflectance))
-    return Footprint(
+    return LineOnScene(
         row=row[_CENTRE],
         reflectance=reflectance[_CENTRE],
         split=split,
