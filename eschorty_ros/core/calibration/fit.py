@@ -343,7 +343,7 @@ def check_targets(targets: Targets, design: RangeModel, names: tuple[str, ...]) 
     if behind.any():
         raise ArgumentError(
             f"range_mm is {targets.range_mm[behind][0]:g}; choose ranges beyond -b_mm = "
-            f"{-design.b_mm:g} mm"
+            f"{0.0 - design.b_mm:g} mm"
         )
     if np.isnan(targets.column).any():
         at = int(np.flatnonzero(np.isnan(targets.column))[0])

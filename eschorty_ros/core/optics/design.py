@@ -197,6 +197,11 @@ def design(
         )
     if b_prime_px is None:
         b_prime_px = k_mm * k_prime_px / _depth("near_mm", near_mm, b_mm)
+        if b_prime_px > -POLE_MARGIN_PX:
+            raise ArgumentError(
+                f"near_mm is {near_mm!r}: row 0 would be within {POLE_MARGIN_PX:g} px of infinity; "
+                f"choose less than {-k_mm * k_prime_px / POLE_MARGIN_PX - b_mm:.6g}"
+            )
     model = RangeModel(
         k_mm=k_mm,
         k_prime_px=k_prime_px,
@@ -299,5 +304,8 @@ def _sensor_tilt_deg(
 def _depth(name: str, range_mm: float | None, b_mm: float) -> float:
     depth = number(name, range_mm) + number("b_mm", b_mm)
     if not 1e-6 < depth < math.inf:
-        raise ArgumentError(f"{name} is {range_mm!r}; choose a range beyond -b_mm = {-b_mm:g} mm")
+        beyond_mm = 0.0 - b_mm
+        raise ArgumentError(
+            f"{name} is {range_mm!r}; choose a range beyond -b_mm = {beyond_mm:g} mm"
+        )
     return depth

@@ -159,7 +159,12 @@ RANGED = {**LENS, "near_mm": 800.0, "far_mm": 2000.0}
         (design, {**TILTED, "baseline_mm": 180.0}, "exactly one"),
         (design, {**TILTED, "near_mm": 800.0}, "exactly one"),
         (design, {**TILTED, "b_prime_px": None}, "exactly one"),
-        (design, {**TILTED, "b_prime_px": None, "near_mm": -3.0}, "near_mm is -3"),
+        (design, {**TILTED, "b_prime_px": None, "near_mm": -3.0}, "near_mm is -3.0.* = 0 mm"),
+        (
+            design,
+            {**TILTED, "b_prime_px": None, "near_mm": 1e9},
+            "near_mm is 1000000000.0.*less than 896116",
+        ),
         (design, {**TILTED, "theta_prime_deg": None, "baseline_mm": 1.0}, "more than f cot"),
         (design_for_ranges, {**RANGED, "far_mm": 700.0}, "far_mm is 700"),
         (design_for_ranges, {**RANGED, "rows": 1}, "rows is 1"),
