@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import click
+
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 
 _CONNECT_S = 30
@@ -27,6 +29,7 @@ def on_cluster(
         raise EschortyError(
             "--dask needs dask.distributed; install it by `pip install distributed`"
         ) from error
+    click.echo(f"connecting to {address}, for up to {_CONNECT_S} s", err=True)
     try:
         # A client that finds no scheduler would wait for it once more when it is deleted.
         asyncio.run(_reach(address))

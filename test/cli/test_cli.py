@@ -558,11 +558,12 @@ def test_a_narrow_terminal_cuts_no_number():
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nowhere.invalid", "tcp://:x"])
-def test_a_scheduler_that_does_not_answer_is_one_line(address, monkeypatch):
+def test_a_scheduler_that_does_not_answer_is_one_line(address, monkeypatch, capsys):
     pytest.importorskip("distributed", reason="distributed is not installed")
     monkeypatch.setattr(cluster, "_CONNECT_S", 0.3)
     with pytest.raises(DeviceError, match="no dask scheduler answers"):
         next(cluster.on_cluster(address, print, [()]))
+    assert capsys.readouterr().err == f"connecting to {address}, for up to 0.3 s\n"
     # A client that is left would warn here.
     gc.collect()
 
