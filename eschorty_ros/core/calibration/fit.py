@@ -365,7 +365,8 @@ def checked_free(free: Sequence[str]) -> tuple[str, ...]:
     names = tuple(free) if isinstance(free, list | tuple) else (free,)
     known = all(isinstance(name, str) and name in EVERY for name in names)
     if not (names and known and len(set(names)) == len(names)):
-        raise ArgumentError(f"free is {free!r}; name each once, of {', '.join(EVERY)}")
+        given = ", ".join(map(str, names)) or "empty"
+        raise ArgumentError(f"free is {given}; name each once, of {', '.join(EVERY)}")
     return names
 
 
