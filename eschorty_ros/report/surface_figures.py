@@ -98,5 +98,9 @@ def joined_figure(points: NDArray[np.void], sizes: Sequence[int], title: str) ->
                 label=f"cloud {number}",
             )  # fmt: skip
         axes.set(xlabel=f"{across} (mm)", ylabel="y (mm)", aspect="equal")
-        axes.legend(markerscale=8)
+    handles, labels = axes.get_legend_handles_labels()
+    # Beside the axes: a flat cloud leaves no room in them.
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=min(len(sizes), 8), markerscale=8
+    )
     return figure

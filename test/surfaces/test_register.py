@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage import read_cloud, write_cloud
+from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
+from eschorty_ros.report.surface_figures import joined_figure
 from eschorty_ros.surfaces.grid import organise
 from eschorty_ros.surfaces.register import join, pose_matrix, register
 
@@ -168,3 +169,14 @@ def test_the_same_scan_twice_has_a_warning(tmp_path):
     done = CliRunner().invoke(main, ["register", file, file, "--out", str(tmp_path / "b.ply")])
     assert done.exit_code == 0, done.output
     assert "check that it is another scan" in done.stderr
+
+
+def test_the_legend_of_a_flat_cloud_is_beside_its_picture():
+    points = np.zeros(20, POINT_DTYPE)
+    points["y"], points["z"] = np.linspace(0.0, 0.01, 20), np.linspace(-0.2, 0.2, 20)
+    figure = joined_figure(points, (10, 10), "flat")
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["cloud 1", "cloud 2"]
+    figure.draw_without_rendering()
+    below = legend.get_window_extent().y1
+    assert all(axes.get_tightbbox().y0 >= below for axes in figure.axes)
