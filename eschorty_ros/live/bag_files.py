@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.storage import EVENTS_FILE
+from eschorty_ros.core.storage import BAG_FILE, EVENTS_FILE
 
 STORAGES = ("mcap", "sqlite3")
-_METADATA, _COMPRESSED = "metadata.yaml", ".zstd"
+_COMPRESSED = ".zstd"
 _ENDINGS = tuple(f"{name}{end}" for name in (".mcap", ".db3") for end in ("", _COMPRESSED))
 
 EVENTS = "event_camera_msgs/msg/EventPacket"
@@ -66,7 +66,7 @@ def is_bag(path: Path) -> bool:
     """Return whether a path is that of a bag: its folder or one file of it."""
     if path.is_dir():
         files = [] if (path / EVENTS_FILE).is_file() else _files_in(path)
-        return (path / _METADATA).is_file() or bool(files)
+        return (path / BAG_FILE).is_file() or bool(files)
     return path.name.lower().endswith(_ENDINGS)
 
 
@@ -76,11 +76,11 @@ def _files_in(folder: Path) -> list[Path]:
 
 def _to_open(path: Path) -> Path:
     """Return the folder of a bag, or its only file; a killed recorder writes no metadata."""
-    if path.is_dir() and not (path / _METADATA).is_file():
+    if path.is_dir() and not (path / BAG_FILE).is_file():
         files = _files_in(path)
         if len(files) > 1:
             raise FormatError(
-                f"{path} has {len(files)} files of bags and no {_METADATA}; give one of them, or "
+                f"{path} has {len(files)} files of bags and no {BAG_FILE}; give one of them, or "
                 "run `ros2 bag reindex`"
             )
         path = files[0] if files else path
@@ -169,7 +169,7 @@ class BagReader:
         except Exception as error:
             raise FormatError(
                 f"cannot read the bag {self.path}: {error or type(error).__name__}; repair it: a "
-                f"cut .mcap with `mcap recover`, its {_METADATA} with `ros2 bag reindex`"
+                f"cut .mcap with `mcap recover`, its {BAG_FILE} with `ros2 bag reindex`"
             ) from error
 
 

@@ -15,6 +15,7 @@ from eschorty_ros.core.storage.cloud import (
     write_cloud,
 )
 from eschorty_ros.core.storage.recording import (
+    BAG_FILE,
     CALIBRATION_FILE,
     EVENTS_FILE,
     LASER_FILE,
@@ -34,6 +35,7 @@ from eschorty_ros.core.storage.recording import (
 )
 
 __all__ = [
+    "BAG_FILE",
     "CALIBRATION_FILE",
     "EVENTS_FILE",
     "FEW_EVENTS",

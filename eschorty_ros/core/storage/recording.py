@@ -35,6 +35,8 @@ TRUTH_FILE = "truth.csv"
 SCAN_FILE = "scan.yaml"
 SETTINGS_FILE = "settings.yaml"
 MARKS_FILE = "marks.csv"
+BAG_FILE = "metadata.yaml"
+"""A rosbag2 has it, and a recording does not."""
 RAW_ALONE = (
     f"a .raw alone goes into a folder as {EVENTS_FILE}, beside {LASER_FILE}, {STAGE_FILE} and "
     f"{CALIBRATION_FILE} (docs/python.md)"
@@ -238,6 +240,8 @@ def _check_files(folder: Path, replaced: set[str]) -> None:
         if name not in replaced and not (folder / name).is_file():
             packed = (folder / f"{name}.gz").is_file()
             missing.append(name + (f" (run gunzip on {name}.gz)" if packed else instead))
+    if missing and (folder / BAG_FILE).is_file():
+        raise FormatError(f"{folder} is a bag; make a recording of it by `eschorty convert`")
     if missing:
         raise FormatError(
             f"{folder}: missing from the recording {'is' if len(missing) == 1 else 'are'} "

@@ -69,6 +69,12 @@ def test_every_missing_file_is_named_beside_a_long_path(tmp_path):
     )
 
 
+def test_a_bag_is_to_be_converted(tmp_path):
+    (tmp_path / "metadata.yaml").touch()
+    with pytest.raises(FormatError, match="is a bag; make a recording of it by `eschorty convert`"):
+        load_recording(tmp_path)
+
+
 def test_layout_of_the_written_files(folder):
     assert (folder / "stage.csv").read_text() == (
         "t_us,position_mm\n0,0.000000\n1000,0.050000\n3000,0.150000\n"
