@@ -319,9 +319,11 @@ def end_light(instrument: Instrument, outcome: Outcome) -> None:
     """Switch the laser off; unless the sequence has succeeded, stop the stage."""
     instrument.shield()
     instrument.watch(False)
-    outcome.attempt(instrument.laser_off)
-    if outcome.end is not End.SUCCEEDED:
-        outcome.attempt(instrument.stop_stage)
+    try:
+        outcome.attempt(instrument.laser_off)
+    finally:
+        if outcome.end is not End.SUCCEEDED:
+            outcome.attempt(instrument.stop_stage)
 
 
 def run_scan(

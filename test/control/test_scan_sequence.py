@@ -107,6 +107,18 @@ def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
     assert steps[-3:] == ["laser_off", "drain", "end_scan"]
 
 
+def test_any_error_of_switching_the_laser_off_leaves_the_stage_at_rest():
+    instrument = RecordingInstrument(("move", 2), ScanFailure("stage: stuck"))
+
+    def laser_off():
+        raise RuntimeError("the context has ended")
+
+    instrument.laser_off = laser_off
+    with pytest.raises(RuntimeError, match="the context has ended"):
+        run_scan(instrument, REQUEST, SETTINGS)
+    assert instrument.calls[-1] == "stop_stage"
+
+
 def test_the_first_reason_stays():
     instrument = RecordingInstrument(("move", 2), ScanFailure("camera: gone"))
 
