@@ -132,7 +132,7 @@ class LaserSupervisor:
         """Set another modulation; light that is on goes on with it, unless it is refused."""
         if self._laser is None:
             return
-        with self._command() as (laser, _):
+        with self._command() as laser:
             before, self._record.modulation = self._record.modulation, modulation
             try:
                 laser.configure(modulation)
@@ -147,27 +147,27 @@ class LaserSupervisor:
         """Return the ticket of a command that is requested now, which disabling voids."""
         return self._in_flight.ticket()
 
-    def arm(self, ticket: int | None = None) -> None:
+    def arm(self, ticket: int) -> None:
         """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be.
 
-        - ``ticket``: That of the request; taken now when omitted.
+        - ``ticket``: That of the request.
         """
         fault = self.interlock.contact_fault()
         if fault:
             raise DeviceError(f"laser refused: {fault}")
-        with self._command(ticket) as (laser, ticket):
+        with self._command() as laser:
             laser.arm()
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 self.interlock.arm()
                 self._record.reason, self._trip_reason = "armed", ""
 
-    def enable(self, ticket: int | None = None) -> None:
+    def enable(self, ticket: int) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails.
 
         - ``ticket``: As for ``arm``.
         """
-        with self._command(ticket) as (laser, ticket):
+        with self._command() as laser:
             with self._locked():
                 self._in_flight.refuse_void(ticket)
                 if self._record.requested is LaserOutput.ON:
@@ -290,9 +290,8 @@ class LaserSupervisor:
             self._later(partial(callback, text))
 
     @contextlib.contextmanager
-    def _command(self, ticket: int | None = None) -> Iterator[tuple[LaserModulator, int]]:
-        """Wait for a turn; gives the laser and the command's ticket."""
-        ticket = self.ticket() if ticket is None else ticket
+    def _command(self) -> Iterator[LaserModulator]:
+        """Wait for a turn; gives the laser."""
         with self._commands:
             with self._locked():
                 laser = self._laser
@@ -300,7 +299,7 @@ class LaserSupervisor:
                     raise DeviceError("laser refused: not open; configure it first")
                 self._commanding = True
             try:
-                yield laser, ticket
+                yield laser
             finally:
                 with self._locked():
                     self._commanding = False

@@ -47,6 +47,14 @@ def supervisor(laser: DelayedLaser) -> Iterator[LaserSupervisor]:
     made.close()
 
 
+def arm(supervisor: LaserSupervisor) -> None:
+    supervisor.arm(supervisor.ticket())
+
+
+def enable(supervisor: LaserSupervisor) -> None:
+    supervisor.enable(supervisor.ticket())
+
+
 class Turns:
     """A lock that counts who waits for it; reading back does not."""
 
@@ -76,9 +84,9 @@ def in_thread(step: Callable[[], None], failures: list[str]) -> threading.Thread
 
 
 def test_enabled_twice_it_stays_on(supervisor, laser):
-    supervisor.arm()
-    supervisor.enable()
-    supervisor.enable()
+    arm(supervisor)
+    enable(supervisor)
+    enable(supervisor)
     assert laser.lit
     assert laser.enablings == 1
 
@@ -87,8 +95,8 @@ def test_light_that_ends_by_itself_is_reported_with_why_it_is_off(laser):
     seen: list[LaserStatus] = []
     interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
     supervisor = opened(laser, interlock, seen.append)
-    supervisor.arm()
-    supervisor.enable()
+    arm(supervisor)
+    enable(supervisor)
     laser.lit = False
     wait_until(lambda: seen[-1].requested is LaserOutput.OFF, "the request to be taken back")
     supervisor.close()
@@ -102,13 +110,13 @@ def test_a_trip_stays_the_reason_until_it_is_armed_again(laser):
     seen: list[LaserStatus] = []
     interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
     supervisor = opened(laser, interlock, seen.append)
-    for request in (supervisor.arm, supervisor.enable):
-        request()
+    for request in (arm, enable):
+        request(supervisor)
     supervisor.trip("interlock open (door); close it")
     # As the scanner does on its way out.
     supervisor.disable("switched off by request")
     assert seen[-1].reason == "interlock open (door); close it"
-    supervisor.arm()
+    arm(supervisor)
     supervisor.disable("switched off by request")
     assert seen[-1].reason == "switched off by request"
     supervisor.close()
@@ -134,8 +142,8 @@ def test_what_to_do_about_an_unknown_output_comes_before_what_tripped_it():
     laser, seen = Lost(), []
     interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
     supervisor = opened(laser, interlock, seen.append)
-    supervisor.arm()
-    supervisor.enable()
+    arm(supervisor)
+    enable(supervisor)
     laser.gone = True
     assert not supervisor.trip("camera/heartbeat reports stopped")
     assert seen[-1].readback.output is LaserOutput.UNKNOWN
@@ -181,7 +189,7 @@ def failing() -> Iterator[tuple[LaserSupervisor, Failing]]:
         log=print, readback_period_s=3600.0,
     )  # fmt: skip
     supervisor.open(laser, Modulation(70.0))
-    supervisor.arm()
+    arm(supervisor)
     yield supervisor, laser
     laser.at = ""
     supervisor.close()
@@ -192,7 +200,7 @@ def test_light_ends_when_enabling_fails_with_any_error(failing, at):
     supervisor, laser = failing
     laser.at = at
     with pytest.raises(ValueError, match=f"{at} failed"):
-        supervisor.enable()
+        enable(supervisor)
     assert not laser.lit
     assert supervisor.status().requested is LaserOutput.OFF
     assert supervisor.status().reason == f"{at} failed"
@@ -200,7 +208,7 @@ def test_light_ends_when_enabling_fails_with_any_error(failing, at):
 
 def test_light_ends_when_configuring_fails_with_any_error(failing):
     supervisor, laser = failing
-    supervisor.enable()
+    enable(supervisor)
     laser.at = "configure"
     with pytest.raises(ValueError, match="configure failed"):
         supervisor.configure(Modulation(80.0))
@@ -210,7 +218,7 @@ def test_light_ends_when_configuring_fails_with_any_error(failing):
 
 def test_output_is_unknown_when_disabling_fails_with_any_error(failing):
     supervisor, laser = failing
-    supervisor.enable()
+    enable(supervisor)
     laser.at = "disable"
     with pytest.raises(DeviceError, match="laser state unknown: disable failed"):
         supervisor.disable("switched off by request")
@@ -221,14 +229,14 @@ def test_output_is_unknown_when_disabling_fails_with_any_error(failing):
 def test_arming_does_not_outlive_disabling(supervisor, laser):
     laser.delayed = "arm"
     failures: list[str] = []
-    arming = in_thread(supervisor.arm, failures)
+    arming = in_thread(lambda: arm(supervisor), failures)
     assert laser.reached.wait(DEADLINE_S)
     supervisor.trip("interlock open")
     laser.go.set()
     arming.join()
     assert failures == ["laser refused: interlock open"]
     with pytest.raises(DeviceError, match="not armed"):
-        supervisor.enable()
+        enable(supervisor)
     assert laser.enablings == 0
 
 
@@ -238,8 +246,8 @@ def test_commands_that_waited_while_it_was_disabled_are_void(supervisor, laser):
     failures: list[str] = []
     begun = [in_thread(lambda: supervisor.configure(Modulation(80.0)), failures)]
     assert laser.reached.wait(DEADLINE_S)
-    begun.append(in_thread(supervisor.arm, failures))
-    begun.append(in_thread(supervisor.enable, failures))
+    begun.append(in_thread(lambda: arm(supervisor), failures))
+    begun.append(in_thread(lambda: enable(supervisor), failures))
     wait_until(lambda: turns.asked == 3, "all three waiting for their turn")
     supervisor.disable("switched off by request")
     laser.go.set()
@@ -269,9 +277,9 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(superv
     laser = Interrupted()
     supervisor.close()
     supervisor.open(laser, Modulation(70.0))
-    supervisor.arm()
+    arm(supervisor)
     failures: list[str] = []
-    enabling = in_thread(supervisor.enable, failures)
+    enabling = in_thread(lambda: enable(supervisor), failures)
     assert laser.reached.wait(DEADLINE_S)
     supervisor.trip("interlock open")
     enabling.join()
@@ -282,8 +290,8 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(superv
 def test_closing_disables_before_it_waits_for_a_check(laser, monkeypatch):
     monkeypatch.setattr(laser_supervisor, "_STOP_TIMEOUT_S", 10.0 * DEADLINE_S)
     supervisor = opened(laser, LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}))
-    supervisor.arm()
-    supervisor.enable()
+    arm(supervisor)
+    enable(supervisor)
     laser.delayed = "readback"
     assert laser.reached.wait(DEADLINE_S)
     closing = in_thread(supervisor.close, [])
@@ -300,8 +308,8 @@ def test_stall_of_this_process_leaves_light_on(monkeypatch):
     interlock = LaserInterlock(10.0, 600.0, {CLIENT_HEARTBEAT: 1.0}, now_s=clock.monotonic)
     supervisor = opened(laser, interlock)
     try:
-        supervisor.arm()
-        supervisor.enable()
+        arm(supervisor)
+        enable(supervisor)
         clock.advance(60.0)
         assert laser.lit
         for _ in range(22):
@@ -340,9 +348,9 @@ def test_a_publisher_that_never_returns_does_not_keep_light_on(laser):
 
     interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
     supervisor = opened(laser, interlock, publish)
-    supervisor.arm()
+    arm(supervisor)
     failures: list[str] = []
-    enabling = in_thread(supervisor.enable, failures)
+    enabling = in_thread(lambda: enable(supervisor), failures)
     assert blocked.wait(DEADLINE_S)
     disabling = in_thread(lambda: supervisor.disable("switched off by request"), failures)
     disabling.join(DEADLINE_S)
@@ -365,8 +373,8 @@ def test_a_status_that_cannot_be_published_ends_no_watchdog(laser):
     for _ in range(2):
         interlock.receive_contact(False)
         interlock.reset_contact([])
-        supervisor.arm()
-        supervisor.enable()
+        arm(supervisor)
+        enable(supervisor)
         assert laser.lit
         interlock.receive_contact(True)
         wait_until(lambda: supervisor.status().requested is LaserOutput.OFF, "the trip")
@@ -383,8 +391,8 @@ def test_the_watchdog_of_a_laser_that_is_lit_runs_no_callback_of_another_thread(
 
     interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
     supervisor = opened(laser, interlock, publish)
-    supervisor.arm()
-    supervisor.enable()
+    arm(supervisor)
+    enable(supervisor)
     end_s = time.monotonic() + 1.0
     while time.monotonic() < end_s:
         supervisor.report()
