@@ -57,7 +57,7 @@ class StagePlacer:
         return self._late_before + self.track.dropped
 
     @property
-    def lost_why(self) -> str:
+    def newest_sample(self) -> str:
         """Return where the newest stage sample is from the last points that were discarded."""
         if self.track.last_us is None:
             return "nothing has come on stage/odom"

@@ -121,6 +121,6 @@ class Reports:
             if now > then
         ]
         if lost[1] > before[1]:
-            lines[-1] += f"; {placer.lost_why}"
+            lines[-1] += f"; {placer.newest_sample}"
             self._node.get_logger().warning(lines[-1], throttle_duration_sec=_REMINDER_S)
         return lines
