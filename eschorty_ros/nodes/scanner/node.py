@@ -126,8 +126,10 @@ class ScannerNode(Node):
 
     def _execute(self, goal: Any) -> Any:
         values = goal.request
+        # Units of one graph may record into the same folder.
+        unique = bytes(goal.goal_id.uuid[:4]).hex()
         request = ScanRequest(
-            scan_id=time.strftime("scan-%Y%m%d-%H%M%S-", time.gmtime()) + f"{self._scans + 1}",
+            scan_id=time.strftime("scan-%Y%m%d-%H%M%S-", time.gmtime()) + unique,
             start_mm=mm_from_m(values.start),
             stop_mm=mm_from_m(values.stop),
             speed_mm_s=mm_from_m(values.speed),
