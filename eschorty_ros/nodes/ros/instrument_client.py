@@ -60,6 +60,7 @@ _HEARTBEAT = "/heartbeat"
 # DDS drops a node that has been killed within 20 s.
 _DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
+_NO_CLOCK = "use_sim_time is true and nothing is on /clock; leave it out with real devices"
 _ASSEMBLE_S = 60.0
 # The reconstruction first works off the packets that a broken link has held back.
 _BEGIN_S = 20.0
@@ -171,6 +172,7 @@ class InstrumentClient(PacedWaiting):
         )
         states = self._states.items()
         return [
+            (lambda: self._now_ns() > 0, f"{self._node.get_name()}: {_NO_CLOCK}"),
             *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
             *((state.active, f"{name}: {_NOT_ACTIVE}") for name, state in states),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),

@@ -28,3 +28,9 @@ def test_scans_of_two_units_in_one_graph_have_different_names(scanner):
         unit.start(**GOAL)
     names = [unit.end()[1].scan_id for unit in units]
     assert names[0].rpartition("-")[2] != names[1].rpartition("-")[2]
+
+
+def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(scanner):
+    goals = scanner(use_sim_time=True)
+    goals.start(**GOAL)
+    goals.wait_for(lambda feedback: "/clock" in feedback.waits_for, "the missing clock")
