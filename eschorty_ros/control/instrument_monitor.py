@@ -183,6 +183,12 @@ class InstrumentMonitor:
         if self.laser.output != LaserOutput.ON:
             raise ScanFailure(f"laser: went off: {self.laser.reason}")
 
+    def check_laser_known(self) -> None:
+        """Raise ``ScanFailure`` with the laser's reason when its output may be on or off."""
+        if self.laser_reports and self.output == LaserOutput.UNKNOWN:
+            assert self.laser is not None
+            raise ScanFailure(f"laser: {self.laser.reason.removeprefix('laser ')}")
+
     def cause_of_no_progress(self) -> str:
         """Return the component without which the reconstruction does not advance."""
         if _age_s(self._reported_s["reconstruction"]) > _STALE_S:

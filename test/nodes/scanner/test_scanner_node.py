@@ -1,36 +1,77 @@
 """The scanner by itself: names of scans, and what it says while it cannot begin."""
 
+import time
+
 import pytest
+from delayed_laser import DelayedLaser
 from eschorty_ros.action import Scan
 from ros_process import NAMESPACE, nodes_here
 from scan_scenarios import Goals
 
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.nodes.laser.node import LaserNode
+from eschorty_ros.nodes.ros import drivers
 from eschorty_ros.nodes.scanner.node import ScannerNode
 
 GOAL = {"start": 0.01, "stop": 0.02, "speed": 0.05}
 
 
 @pytest.fixture
-def scanner(observer):
-    """A function that starts a scanner; it returns the goals of its scans."""
-    with nodes_here(observer.domain, 4) as start:
-
-        def started(namespace=NAMESPACE, **parameters):
-            start(lambda **given: ScannerNode(**(given | {"namespace": namespace})), **parameters)
-            return Goals(observer, Scan, f"{namespace}/scan", f"{namespace}/scanner")
-
-        yield started
+def start(observer):
+    """A function that starts nodes: ``(kind, **parameters)``."""
+    with nodes_here(observer.domain, 4) as made:
+        yield made
 
 
-def test_scans_of_two_units_in_one_graph_have_different_names(scanner):
-    units = [scanner(unit, node_timeout=0.1) for unit in ("/left", "/right")]
+def scans(observer, start, namespace=NAMESPACE, **parameters):
+    """Return the goals of a new scanner."""
+    start(lambda **given: ScannerNode(**(given | {"namespace": namespace})), **parameters)
+    return Goals(observer, Scan, f"{namespace}/scan", f"{namespace}/scanner")
+
+
+def test_scans_of_two_units_in_one_graph_have_different_names(observer, start):
+    units = [scans(observer, start, unit, node_timeout=0.1) for unit in ("/left", "/right")]
     for unit in units:
         unit.start(**GOAL)
     names = [unit.end()[1].scan_id for unit in units]
     assert names[0].rpartition("-")[2] != names[1].rpartition("-")[2]
 
 
-def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(scanner):
-    goals = scanner(use_sim_time=True)
+def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(observer, start):
+    goals = scans(observer, start, use_sim_time=True)
     goals.start(**GOAL)
     goals.wait_for(lambda feedback: "/clock" in feedback.waits_for, "the missing clock")
+
+
+class Lost(DelayedLaser):
+    """Cannot be reached once it is ``gone``."""
+
+    gone = False
+
+    def disable(self):
+        if self.gone:
+            raise DeviceError("switch the generator off by hand")
+        super().disable()
+
+    def readback(self):
+        if self.gone:
+            raise DeviceError("no answer")
+        return super().readback()
+
+
+def test_a_laser_that_has_failed_ends_the_scan_at_once_with_its_reason(
+    observer, start, monkeypatch
+):
+    laser = Lost()
+    monkeypatch.setattr(drivers, "make", lambda *_: laser)
+    goals = scans(observer, start)
+    start(LaserNode)
+    observer.wait_for_state("laser", "active")
+    laser.gone = True
+    observer.wait_for_state("laser", "unconfigured")
+    begun_s = time.monotonic()
+    goals.start(**GOAL)
+    _, result = goals.end()
+    assert result.message == "laser: state unknown: switch the generator off by hand"
+    assert time.monotonic() - begun_s < 10.0
+    laser.gone = False
