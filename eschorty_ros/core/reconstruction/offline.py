@@ -124,8 +124,9 @@ def reconstruct_recording(
     warnings = (
         *map(str, reader.warnings),
         *wrapped,
-        *reconstructor.warnings,
-        *recording_warnings(recording, used, counters, points, span_us, shown),
+        *recording_warnings(
+            recording, used, counters, points, span_us, shown, reconstructor.warnings
+        ),
     )
     return Result(
         points=points,

@@ -70,17 +70,21 @@ def recording_warnings(
     points: Points,
     span_us: tuple[int, int] | None,
     shown: Shown,
+    of_stream: list[str],
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
+
+    A wrong frequency comes first: warnings of the stream follow from it.
 
     - ``counters``: See `Result`.
     - ``points``: The cloud, of POINT_DTYPE.
     - ``span_us``: Sensor times of the first and the last event, ``None`` without events.
     - ``shown``: See `shown_modulation`.
+    - ``of_stream``: Warnings of the `Reconstructor`.
     """
     found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:
-        return [*found, f"no points: {without_modulation(0, 0.0)}"]
+        return [*of_stream, *found, f"no points: {without_modulation(0, 0.0)}"]
     stated_hz, shown_hz = recording.modulation.frequency_hz, shown.frequency_hz
     if recording.calibration_replaced:
         found.append(
@@ -91,11 +95,12 @@ def recording_warnings(
     found += stage_faults(recording, span_us)
     if len(points):
         found += sampling_faults(recording, span_us, float(np.median(points["sigma"])) * 1e3)
+    wrong_frequency = []
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
         or_slow = f", or the pixels follow one period of {multiple:.0f}" if whole else ""
-        found.append(
+        wrong_frequency.append(
             f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
             f"{shown_hz:.4g} Hz; correct it{or_slow}, or where it is right let the camera send "
             "fewer events: a full readout delays them"
@@ -119,10 +124,11 @@ def recording_warnings(
             f"{len(points) + without_stage:,} points have no stage position; give the stage log "
             "of the same time"
         )
-    if without_stage or (found and len(points)):
-        return found
+    lines = [*wrong_frequency, *of_stream, *found]
+    if without_stage or ((wrong_frequency or found) and len(points)):
+        return lines
     dark = without_modulation(counters["events"], stated_hz)
-    return [*found, *few_points(settings, counters, points, dark, shown_hz is not None)]
+    return [*lines, *few_points(settings, counters, points, dark, shown_hz is not None)]
 
 
 def _duty_faults(modulation: Modulation, shown: float | None) -> list[str]:

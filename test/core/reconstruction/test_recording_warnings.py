@@ -236,6 +236,12 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
     assert sum(words in line for line in result.warnings) == 1, result.warnings
 
 
+@pytest.mark.parametrize("hz", [35, 210])
+def test_a_wrong_frequency_comes_before_the_warnings_that_follow_from_it(recording, hz):
+    first, *_ = reconstruct_recording(at_hz(recording, hz)).warnings
+    assert f"given as {hz} Hz and the events show 70" in first
+
+
 FORTH_MM = np.linspace(10.0, 40.0, 60)
 SWEEP_MM = np.concatenate([np.full(600, 10.0), FORTH_MM, FORTH_MM[::-1]])
 NOISE_MM = np.random.default_rng(1).normal(0.0, 1.0, SWEEP_MM.size)
