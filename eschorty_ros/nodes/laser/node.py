@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -38,6 +40,7 @@ from eschorty_ros.nodes.ros.steady_timer import steady_timer
 STATE_RATE_HZ = 2.0
 THREADS = 4
 _COMMANDS_MAX = THREADS - 2
+_REFUSAL_LOG_S = 5.0
 WATCHED = ("camera", "stage")
 
 TABLE = (
@@ -100,6 +103,8 @@ class LaserNode(DeviceNode):
         # Disabling must wait neither for a command in progress nor for a thread: the supervisor
         # orders the others, and not all threads may wait for them.
         self._commands = threading.BoundedSemaphore(_COMMANDS_MAX)
+        self._refused = 0
+        self._refusals_logged: dict[str, tuple[str, float]] = {}
         control = ReentrantCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
@@ -182,12 +187,12 @@ class LaserNode(DeviceNode):
         self._supervisor.configure(_modulation(values))
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._attempted(self._arm)
+        response.success, response.message = self._attempted("arm", self._arm)
         return response
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        step = self._enable if request.data else self._disable
-        response.success, response.message = self._attempted(step)
+        name, step = ("enable", self._enable) if request.data else ("disable", self._disable)
+        response.success, response.message = self._attempted(name, step)
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -197,12 +202,21 @@ class LaserNode(DeviceNode):
         self._supervisor.report()
         return response
 
-    def _attempted(self, step: Callable[[], str]) -> tuple[bool, str]:
+    def _attempted(self, name: str, step: Callable[[], str]) -> tuple[bool, str]:
         try:
             return True, step()
         except EschortyError as error:
-            self.get_logger().warning(str(error))
+            self._note_refusal(name, str(error))
             return False, str(error)
+
+    def _note_refusal(self, name: str, reason: str) -> None:
+        """Count a refusal; log its reason, the same one of a command every 5 s only."""
+        self._refused += 1
+        logged, at_s = self._refusals_logged.get(name, ("", -math.inf))
+        now_s = time.monotonic()
+        if reason != logged or now_s - at_s > _REFUSAL_LOG_S:
+            self._refusals_logged[name] = reason, now_s
+            self.get_logger().warning(f"{reason} ({self._refused} refused so far)")
 
     def _arm(self) -> str:
         with self._accepted() as ticket:
@@ -310,6 +324,7 @@ class LaserNode(DeviceNode):
             "foreign_heartbeats": interlock.foreign_heartbeats,
             "reason": status.reason if status else "",
             "switch_offs": supervisor.switch_offs,
+            "refused": self._refused,
         }
         if status is not None:
             values |= status.readback.counters

@@ -68,7 +68,6 @@ _BEGIN_S = 20.0
 _LATE_NODE_WAIT_S = 0.3
 _LEAST_WAIT_S = 0.1
 _CLOCKS_S = 20.0
-# The laser's node logs every refusal.
 _ENABLE_AGAIN_S = 0.25
 
 

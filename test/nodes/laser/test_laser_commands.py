@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from delayed_laser import DelayedLaser
+from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import LaserState
 from ros_process import Observer, nodes_here, wait_until
 from std_msgs.msg import Bool, Header
@@ -84,3 +85,26 @@ def test_interlock_that_is_reported_open_repeatedly_switches_off_once(
         interlock.publish(Bool(data=True))
     wait_until(lambda: states and states[-1].interlock_open, "the open interlock")
     assert laser.offs == before + 1
+
+
+@pytest.mark.usefixtures("laser")
+def test_refusals_of_one_cause_are_logged_once_and_counted(
+    observer: Observer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+
+    def enable() -> str:
+        return str(observer.call(SetBool, "laser/enable", SetBool.Request(data=True)).message)
+
+    reasons = [enable() for _ in range(4)]
+    observer.call(Trigger, "laser/arm")
+    reasons.append(enable())
+    assert len(set(reasons)) == 2
+    assert "not armed" in reasons[0]
+    log = capfd.readouterr().err
+    assert [log.count(reason) for reason in sorted(set(reasons))] == [1, 1]
+    wait_until(lambda: values(reports).get("refused") == "5", "the count in the diagnostics")
+
+
+def values(reports: list[DiagnosticArray]) -> dict[str, str]:
+    return {pair.key: pair.value for report in reports for pair in report.status[0].values}
