@@ -81,17 +81,19 @@ class ReconstructionNode(Node):
         super().__init__("reconstruction", **kwargs)
         self.parameters = Parameters(self, TABLE, self._on_change)
         self.calibration = load_calibration(self.parameters["calibration"])
+        # As the worker uses them, which follows the parameters.
+        self._settings = settings_of(self.parameters, Settings)
         slow = threading.Timer(_COMPILING_S, self.get_logger().info, (_COMPILING,))
         slow.start()
         try:
-            warm_up(self.calibration, settings_of(self.parameters, Settings))
+            warm_up(self.calibration, self._settings)
         finally:
             slow.cancel()
         self._override = modulation_override(self.parameters)
         check_record_name(self.parameters["record_name"])
         self._pipeline = Pipeline(
             self.calibration,
-            settings_of(self.parameters, Settings),
+            self._settings,
             self.parameters["clock_timeout"],
             self.parameters["stage_gap"],
             self.parameters["stage_timeout"],
@@ -106,7 +108,7 @@ class ReconstructionNode(Node):
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
         self._camera_roi = CameraRoi(self, self.parameters["camera_roi"] == "follow")
-        self._camera_roi.follow(settings_of(self.parameters, Settings), self.calibration.model())
+        self._camera_roi.follow(self._settings, self.calibration.model())
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
         self.get_logger().info(self._sources())
@@ -255,7 +257,7 @@ class ReconstructionNode(Node):
         def use() -> None:
             self._pipeline.set_calibration(calibration)
             self.calibration = calibration
-            self._camera_roi.follow(settings_of(self.parameters, Settings), calibration.model())
+            self._camera_roi.follow(self._settings, calibration.model())
 
         done, reason = self._in_worker(use)
         if not done:
@@ -357,6 +359,12 @@ class ReconstructionNode(Node):
                 throttle_duration_sec=1.0,
             )
 
+    def _use_settings(self, settings: Settings) -> None:
+        self._settings = settings
+        self._pipeline.stream.set_settings(settings)
+        # Here, as the calibration is exchanged in this thread, too.
+        self._camera_roi.follow(settings, self.calibration.model())
+
     def _step(self) -> None:
         self._follow_clock()
         # A profile leaves before its points are placed, which it does not need.
@@ -372,8 +380,7 @@ class ReconstructionNode(Node):
         check_record_name(values["record_name"])
         settings = settings_of(values, Settings)
         override = modulation_override(values)
-        self._camera_roi.follow(settings, self.calibration.model())
-        self._post(partial(self._pipeline.stream.set_settings, settings))
+        self._post(partial(self._use_settings, settings))
         self._jobs.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override
         self._post(partial(self._pipeline.stream.set_override, override))

@@ -1,17 +1,21 @@
 """The camera's region of interest follows the one that is reconstructed."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
+from eschorty_ros.srv import LoadCalibration
 from rclpy.node import Node
 from reconstructing import CALIBRATION
 from ros_process import nodes_here
 from waiting import wait_until
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.optics import save_named_calibration
+from eschorty_ros.core.reconstruction import Settings, region_window
 from eschorty_ros.nodes.reconstruction.camera_roi import CameraRoi
+from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 
 MODEL = CALIBRATION.model()
 FULL = [0, 0, MODEL.columns, MODEL.rows]
@@ -74,6 +78,37 @@ def test_a_camera_that_is_to_be_left_alone_is(observer):
         time.sleep(1.0)
         assert camera.roi() == [0, 0, 8, 8]
         roi.check_full()
+
+
+def test_a_calibration_exchanged_while_the_settings_change_gives_the_window_of_both(
+    observer, monkeypatch, tmp_path
+):
+    other = replace(CALIBRATION, b_prime_px=CALIBRATION.b_prime_px + 20.0)
+    save_named_calibration(tmp_path, other, "other")
+    follow, loading = CameraRoi.follow, []
+
+    def slow_follow(roi: CameraRoi, settings: Settings, model: Any) -> None:
+        if settings.range_max and not loading:
+            loading.append(load.call_async(LoadCalibration.Request(calibration="other")))
+            # It ends here unless it waits, as it should, for the end of this change.
+            end_s = time.monotonic() + 1.0
+            while not loading[0].done() and time.monotonic() < end_s:
+                time.sleep(0.01)
+        follow(roi, settings, model)
+
+    monkeypatch.setattr(CameraRoi, "follow", slow_follow)
+    given = {"calibration_folder": str(tmp_path), "camera_roi": "follow", "frequency": 70.0}
+    with nodes_here(observer.domain, 4) as start:
+        start(ReconstructionNode, **given)
+        camera = start(Camera)
+        load = observer.node.create_client(LoadCalibration, "reconstruction/load_calibration")
+        wait_until(load.service_is_ready, "the service")
+        assert observer.set_parameter("reconstruction", "range_max", 1.2)[0]
+        wait_until(lambda: loading and loading[0].done(), "the exchange")
+        assert loading[0].result().success
+        window = region_window(Settings(range_max=1.2), other.model())
+        assert window != region_window(Settings(range_max=1.2), MODEL)
+        wait_until(lambda: camera.roi() == list(window), "the window")
 
 
 def test_a_camera_that_refuses_is_reported(observer, capfd):
