@@ -184,7 +184,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     from eschorty_ros.simulation.scenes import names as scenes
     from eschorty_ros.simulation.world import Effects
 
-    if result.success or len(result.points):
+    if len(result.points):
         cloud = result.points if result.organized is None else result.organized
         report_replaced(out / "scan.pcd")
         write_cloud(out / "scan.pcd", cloud)

@@ -152,16 +152,17 @@ def test_options_on_the_command_line_win_over_the_hardware_file(tmp_path, monkey
         assert seen == {"calibration": expected, "keep": "good", "events_min": 7}
 
 
-def test_a_scan_without_points_is_no_success(tmp_path):
+def test_a_scan_without_points_is_no_success_and_leaves_an_older_cloud(tmp_path):
     request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
     points = np.empty(0, POINT_DTYPE)
+    (tmp_path / "scan.pcd").write_text("older")
     with pytest.raises(DeviceError, match="no points: no events came"):
         finish(
             request,
             ScanResult(True, "no points: no events came", points, 0, 0, 0, 0, "failed", 0.0),
             tmp_path,
         )
-    assert len(read_cloud(tmp_path / "scan.pcd")) == 0
+    assert (tmp_path / "scan.pcd").read_text() == "older"
 
 
 def test_what_a_scan_lost_is_printed(tmp_path, capsys):
