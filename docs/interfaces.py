@@ -51,7 +51,7 @@ TOPICS = {
     "stage/heartbeat": "10 Hz while the stage is active",
     "profile": "one profile in `eschorty_link`; `profile_rate_max` at most",
     "points": "batches in `eschorty_base`, 20 Hz at most",
-    "scan/points": "the assembled scan in `eschorty_base`",
+    "scan/points": "the last scan with points, assembled, in `eschorty_base`",
     "event_frame": "recent events, `mono8`, 10 Hz at most",
     "reconstruction/state": "progress and losses, 5 Hz",
     "reconstruction/heartbeat": "10 Hz while it works; a scan ends without it",

@@ -281,8 +281,8 @@ class ReconstructionNode(Node):
         message = "; ".join(fault for fault in (*faults.values(), pause) if fault)
         return message, several or bool(faults["stage/odom"] or pause)
 
-    def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
-        self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")
+    def _publish_scan(self, scan: AssembledScan) -> None:
+        self._outputs.scan(scan, self.parameters["organized"] == "on")
 
     def _recorder(
         self, scan_id: str, start_mm: float, stop_mm: float, passes: int

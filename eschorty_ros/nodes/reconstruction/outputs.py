@@ -127,14 +127,15 @@ class Outputs:
             self._points.publish(serialized_cloud(live, stamp_ns, self._names.base))
             parts = left
 
-    def scan(self, scan: AssembledScan, fallback_stamp_ns: int, organized: bool) -> None:
-        """Publish an assembled scan, also an empty one; ``organized``: as a height map."""
-        stamp_ns = scan.stamp_ns if len(scan.points) else fallback_stamp_ns
+    def scan(self, scan: AssembledScan, organized: bool) -> None:
+        """Publish an assembled scan, ``organized`` as a height map; an empty one replaces none."""
         points = scan.points
+        if not len(points):
+            return
         if organized:
             try:
                 points = height_map(points, scan.edge_ns, self._columns)
             except ArgumentError as error:
                 # The parameter returns was changed during the scan.
                 self._node.get_logger().warning(f"scan/points is not organized: {error}")
-        self._scan.publish(cloud_message(points, stamp_ns, self._names.base))
+        self._scan.publish(cloud_message(points, scan.stamp_ns, self._names.base))

@@ -48,7 +48,7 @@ class ScanServices:
       failure.
     - ``running``: Returns whether the worker runs.
     - ``stage_timeout_s``: Longest wait of points for the stage after the end.
-    - ``publish``: Publishes a finished scan, given the ROS time (ns) for one without points.
+    - ``publish``: Publishes a finished scan.
     - ``recorder``: Returns a recorder for a scan's log, ``None`` when scans are not recorded.
 
     Public attribute ``recordings``: Folders of the scans recorded so far.
@@ -62,7 +62,7 @@ class ScanServices:
         in_worker: Callable[[Callable[[], None], float], tuple[bool, str]],
         running: Callable[[], bool],
         stage_timeout_s: float,
-        publish: Callable[[AssembledScan, int], None],
+        publish: Callable[[AssembledScan], None],
         recorder: Callable[[str, float, float, int], ScanRecorder | None],
     ) -> None:
         self._node, self._pipeline, self._fault = node, pipeline, fault
@@ -99,7 +99,7 @@ class ScanServices:
             if report.pass_lag is not None:
                 behind = f"points were {report.pass_lag} behind the stage"
                 self._node.get_logger().info(f"{behind}; taken off")
-            self._publish(report.scan, self._node.get_clock().now().nanoseconds)
+            self._publish(report.scan)
             ended(report)
 
     def _on_begin(self, request: Any, response: Any) -> Any:

@@ -9,8 +9,9 @@ from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, place
+from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.live.device_messages import ns_from_stamp
-from eschorty_ros.live.scan_buffer import PlacedPoints
+from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.reconstruction import outputs as outputs_module
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
@@ -121,3 +122,13 @@ def test_points_wait_until_they_are_due(monkeypatch):
     outputs.points([])
     assert not outputs.waits
     assert len(node.topics["points"]) == 2
+
+
+def test_a_scan_without_points_leaves_the_cloud_before():
+    node = Node()
+    outputs = Outputs(node, CALIBRATION, 1000.0, FRAMES)
+    outputs.scan(ScanBuffer("empty", 0.0, 100.0).assemble(), False)
+    assert node.topics["scan/points"] == []
+    points = np.zeros(4, POINT_DTYPE)
+    outputs.scan(AssembledScan(points, np.zeros(4, np.int64), ZERO_NS, 1, 1e-3), False)
+    assert [message.width for message in node.topics["scan/points"]] == [4]
