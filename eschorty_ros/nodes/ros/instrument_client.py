@@ -350,7 +350,9 @@ class ScanClient(InstrumentClient):
         state = self.monitor.reconstruction
         if state is not None and state.scan_id:
             self._node.get_logger().warning(f"ending {state.scan_id}, which was left open")
-            self.end_scan(state.scan_id)
+            # The reconstruction may end it meanwhile; what else fails, fails again.
+            with contextlib.suppress(ScanFailure):
+                self.end_scan(state.scan_id)
         begin = BeginScan.Request(
             scan_id=request.scan_id,
             start=m_from_mm(request.start_mm),

@@ -64,6 +64,17 @@ def test_a_scan_that_is_refused_begins_later_if_the_reason_may_pass(retry):
             client.begin_scan(request)
 
 
+def test_a_scan_left_open_that_ends_meanwhile_does_not_fail_the_next():
+    client = CanceledClient(canceled=False)
+    client._node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=lambda _: None))
+    client.monitor.reconstruction = SimpleNamespace(scan_id="open")
+    ended = SimpleNamespace(success=False, message="scan 'open' is not being collected")
+    client._clients["reconstruction/end_scan"] = SimpleNamespace(
+        call_async=lambda request: Answered(ended, 3)
+    )
+    client.begin_scan(ScanRequest("s", 20.0, 40.0, 50.0, 70.0))
+
+
 def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
     reason = "laser refused: camera/heartbeat reports stopped; look at the camera node"
     client, refusals, waits = CanceledClient(canceled=False), [reason, reason, ""], []
