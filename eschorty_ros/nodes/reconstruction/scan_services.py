@@ -186,12 +186,13 @@ class ScanServices:
             reports.append(report)
             finished.set()
 
+        end_s = time.monotonic() + self._timeout_s
         response.success, response.message = self._in_worker(
-            partial(self._begin_end, request.scan_id, done), _ASSEMBLE_S
+            partial(self._begin_end, request.scan_id, done), self._timeout_s
         )
         if not response.success:
             return response
-        if not self._awaited(finished):
+        if not self._awaited(finished, end_s):
             response.success = False
             response.message = "the scan was not assembled in time; see the node's log"
             return response
@@ -209,9 +210,8 @@ class ScanServices:
         response.message = "; ".join(text for text in (report.message, fault) if text)
         return response
 
-    def _awaited(self, event: threading.Event) -> bool:
+    def _awaited(self, event: threading.Event, end_s: float) -> bool:
         """Wait for the worker's event; after a signal it may not come."""
-        end_s = time.monotonic() + self._timeout_s
         while not event.wait(0.1):
             if time.monotonic() > end_s or not self._running():
                 return event.is_set()

@@ -61,7 +61,8 @@ _HEARTBEAT = "/heartbeat"
 _DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
 _NO_CLOCK = "use_sim_time is true and nothing is on /clock; leave it out with real devices"
-_ASSEMBLE_S = 60.0
+# Longer than until the reconstruction gives up, with the longest stage_timeout.
+_ASSEMBLE_S = 100.0
 # The reconstruction first works off the packets that a broken link has held back.
 _BEGIN_S = 20.0
 # For an answer of a node that no longer reports.

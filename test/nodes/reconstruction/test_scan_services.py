@@ -2,6 +2,7 @@
 
 import math
 import time
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -12,7 +13,9 @@ from ros_process import NodeProcess, Observer, Remap, nodes_here
 from std_msgs.msg import Header
 from waiting import wait_until
 
+from eschorty_ros.nodes.reconstruction import scan_services
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
+from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.spin import make_safe
 
@@ -147,6 +150,30 @@ def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnosti
         "the reason in the diagnostics",
     )
     assert end(observer, "evt2").message == f"3 packets were refused, the last: {reason}"
+
+
+def test_the_end_of_a_scan_is_answered_within_one_wait(monkeypatch):
+    """A client waits for it no longer, however the worker divides the time."""
+    monkeypatch.setattr(scan_services, "_ASSEMBLE_S", 2.0)
+
+    def in_worker(job, timeout_s):
+        time.sleep(0.8 * timeout_s)
+        job()
+        return True, ""
+
+    with Observer() as observer:
+        pipeline = SimpleNamespace(scan_id="long", close_period=lambda *_: None)
+        nothing = lambda *_: None  # noqa: E731
+        ScanServices(
+            observer.node, pipeline, lambda: ("", False), in_worker, lambda: True, 0.0, nothing,
+            nothing,
+        )  # fmt: skip
+        client = observer.node.create_client(EndScan, "reconstruction/end_scan")
+        answer = client.call_async(EndScan.Request(scan_id="long"))
+        begun_s = time.monotonic()
+        wait_until(answer.done, "the answer")
+        assert "not assembled in time" in answer.result().message
+        assert time.monotonic() - begun_s < 3.0
 
 
 def test_a_reconstruction_on_its_way_out_reports_at_once_that_it_stops():
