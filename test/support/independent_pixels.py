@@ -131,6 +131,23 @@ class Camera:
             self.end_us,
         )
 
+    def flickering(self, hz: float, events: float, columns: int) -> Events:
+        """Return the events of a lamp on all pixels of the first ``columns``.
+
+        A pixel has this many ``events`` of each polarity per cycle, on average.
+        """
+        cycles = int((self.end_us - FIRST_EDGE_US) * 1e-6 * hz)
+        each = int(events * columns * ROWS * cycles)
+        parts = []
+        for polarity in (1, 0):
+            phase = self.rng.integers(0, cycles, each) + self.rng.normal(
+                0.25 if polarity else 0.75, 0.08, each
+            )
+            t = FIRST_EDGE_US + np.rint(np.maximum(phase, 0.0) * 1e6 / hz).astype(np.int64)
+            x, y = (self.rng.integers(0, n, each).astype(np.uint16) for n in (columns, ROWS))
+            parts.append((t, x, y, np.full(each, polarity, np.uint8)))
+        return joined(parts)
+
     def hot_pixels(self, pixels: int, rate_hz: float) -> Events:
         """Return the events of pixels that fire all the time."""
         x, y = self.rng.integers(0, COLUMNS, pixels), self.rng.integers(0, ROWS, pixels)

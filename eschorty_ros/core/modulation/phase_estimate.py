@@ -39,7 +39,10 @@ class PhaseEstimate:
 
 
 def estimate_phase(
-    t_us: NDArray[np.int64], polarity: NDArray[np.uint8], modulation: Modulation
+    t_us: NDArray[np.int64],
+    polarity: NDArray[np.uint8],
+    modulation: Modulation,
+    weights: NDArray[np.float64] | None = None,
 ) -> PhaseEstimate:
     """Return a rising edge from a window of events, by circular statistics at the known frequency.
 
@@ -50,6 +53,7 @@ def estimate_phase(
     - ``t_us``: Shape (n,), in time order.
     - ``polarity``: Shape (n,), 1 for ON.
     - ``modulation``: ``on_edge_us`` is not used.
+    - ``weights``: Shape (n,), all 1 when omitted; negative ones take off background.
 
     Raises ``ArgumentError`` when there are no events, or they are not in time order.
     """
@@ -68,20 +72,23 @@ def estimate_phase(
     phase = (t_us - origin) / period_us
     phase -= modulation.duty * (polarity == 0)
     phase -= np.floor(phase)
-    strength = float(abs(np.exp(2j * np.pi * phase).mean()))
-    found = strength * strength * t_us.size > _RAYLEIGH_MIN
+    if weights is None:
+        weights = np.ones(t_us.size)
+    vector = abs(weights @ np.exp(2j * np.pi * phase))
+    strength = min(float(vector / max(weights.sum(), 1.0)), 1.0)
+    found = bool(vector * vector > _RAYLEIGH_MIN * (weights @ weights))
     gap_bins = min(math.ceil(_ROW_US * _HISTOGRAM_BINS / period_us), _GAP_BINS_MAX)
-    begin = _burst_begin(phase, gap_bins) if found else 0.0
+    begin = _burst_begin(phase, weights, gap_bins) if found else 0.0
     return PhaseEstimate(origin + round(begin * period_us), strength, found)
 
 
-def _burst_begin(phase: NDArray[np.float64], gap_bins: int) -> float:
+def _burst_begin(phase: NDArray[np.float64], weights: NDArray[np.float64], gap_bins: int) -> float:
     """Return the phase, 0 to 1, at which the largest burst rises above the background.
 
     It may be as low for less than ``gap_bins``.
     """
     bins = np.minimum((phase * _HISTOGRAM_BINS).astype(np.int64), _HISTOGRAM_BINS - 1)
-    counts = np.bincount(bins, minlength=_HISTOGRAM_BINS).astype(np.float64)
+    counts = np.bincount(bins, weights, _HISTOGRAM_BINS)
     smooth = counts + np.roll(counts, 1) + np.roll(counts, -1)
     peak = int(np.argmax(smooth))
     background = float(np.quantile(counts, 0.2))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.modulation.edges import EdgeSchedule
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
+from eschorty_ros.core.modulation.line_rows import line_rows
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import (
     PhaseEstimate,
@@ -20,6 +24,8 @@ _BLOCK_PERIODS = 32
 BLOCK_US = 16_000
 _EVENTS_MIN = 128
 _EVENTS_ENOUGH = 2048
+# Events of the first periods that are looked at, evenly spread.
+_SAMPLE = 1 << 20
 _GAIN = 0.5
 # Shares of the period. A larger difference is not drift but a generator that was restarted, if two
 # blocks agree on it.
@@ -41,10 +47,14 @@ class PhaseLock:
     Nothing is moved where ``on_edge_us`` is given or triggers come.
 
     - ``every``: See ``EdgeSchedule``.
+
+    Public attribute ``window``: First and last of the held events that showed the phase, ``None``
+    where it was known.
     """
 
     def __init__(self, modulation: Modulation, every: int) -> None:
         self.schedule = EdgeSchedule(modulation, every)
+        self.window: tuple[int, int] | None = None
         self._ended = False
         self._modulation = modulation
         self._block = max(_BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
@@ -84,7 +94,7 @@ class PhaseLock:
             self.schedule.anchor(self._modulation.on_edge_us, first_us)
             return True
         while True:
-            t, _, _, p = held.arrays
+            t = held.arrays[0]
             begin = held.searched
             window = estimation_window(t[begin:], now_us, self._modulation)
             end_us = END_OF_STREAM_US if window is None else window.end_us
@@ -95,8 +105,9 @@ class PhaseLock:
             if window is None:
                 break
             end = begin + window.size
-            estimate = estimate_phase(t[begin:end], p[begin:end], self._modulation)
+            estimate = self._estimate([values[begin:end] for values in held.arrays])
             if estimate.found:
+                self.window = begin, end
                 return self._anchor(estimate, first_us)
             held.searched = end
             if end > HELD_EVENTS_MAX:
@@ -105,12 +116,18 @@ class PhaseLock:
                     return False
                 first_us = int(held.arrays[0][0])
         if last:
-            estimate = estimate_phase(t, p, self._modulation)
+            estimate = self._estimate(held.arrays)
             if estimate.found:
                 return self._anchor(estimate, first_us)
             self._ended = True
             held.refuse(len(held))
         return False
+
+    def _estimate(self, events: Sequence[NDArray[Any]]) -> PhaseEstimate:
+        stride = max(events[0].size // _SAMPLE, 1)
+        t_us, column, row, polarity = (values[::stride] for values in events)
+        weights = line_rows(column, row).weights
+        return estimate_phase(t_us, polarity, self._modulation, weights)
 
     def _anchor(self, estimate: PhaseEstimate, first_us: int) -> bool:
         self.schedule.anchor(estimate.edge_us, first_us)

@@ -122,7 +122,9 @@ class PeriodCutter:
             schedule.every = self._length.choose(self._held, watermark_us, last)
         if schedule.every == 0 or not self.lock.find(self._held, watermark_us, last):
             return False
-        self._assembler.restart(self._modulation, schedule.every)
+        window = self.lock.window or self._length.window
+        first = None if window is None else _part(self._held.arrays, *window)
+        self._assembler.restart(self._modulation, schedule.every, schedule.last_us, first)
         return True
 
     def _assign_held(self, watermark_us: int) -> None:

@@ -29,6 +29,7 @@ from eschorty_ros.core.line.estimators import FULL_COLUMN_METHODS
 from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.background_gate import background_gate_us
 from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, _gate_part
 from eschorty_ros.core.optics import RangeModel
@@ -88,6 +89,7 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
+        self._window_rows = settings.line_width_px
         self._takes_background = settings.centroid in FULL_COLUMN_METHODS
         if self._takes_background and self._gate_us == GATE_LEARNED:
             # It is learned from the rows of lines.
@@ -100,18 +102,25 @@ class ProfileAssembler:
         self._boxed_memory = Boxed(memory)
         self._boxed = Boxed(_Open(self._boxed_memory, Pointer(_end, self._boxed_memory)))
 
-    def restart(self, modulation: Modulation, every: int) -> None:
+    def restart(
+        self, modulation: Modulation, every: int, edge_us: int, first: Arrays | None = None
+    ) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``.
 
-        ``every`` is the number of periods in a profile.
+        - ``every``: Number of periods in a profile.
+        - ``edge_us``: A rising edge of the laser.
+        - ``first``: Events of the first periods, ``None`` where there were none to wait for.
         """
+        gate_us = self._gate_us
+        if gate_us == GATE_LEARNED and first is not None:
+            gate_us = background_gate_us(first, edge_us, modulation, self._window_rows)
         lit = light(modulation, every)
         if self._takes_background:
             # It comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
         self._use(
             self._memory._replace(
-                gate=make_gate(modulation, self._gate_us),
+                gate=make_gate(modulation, gate_us),
                 blink=blink(modulation, every),
                 light=lit,
             )

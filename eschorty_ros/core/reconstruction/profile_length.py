@@ -13,6 +13,7 @@ from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.line.blinking import PERIOD_MIN_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
+from eschorty_ros.core.modulation.line_rows import line_rows
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
@@ -36,7 +37,7 @@ _PROFILES_MIN = 4
 # Part of the events of the fullest period that periods in the dark do not reach.
 _LIT_SHARE = 0.125
 # Events of a window that are looked at, evenly spread.
-_SAMPLE = 4096
+_SAMPLE = 1 << 16
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
 _CELL_BITS = 4
 _LINE_CELLS_MAX = 8.0
@@ -69,7 +70,7 @@ class ProfileLength:
         self._modulation = modulation
         self._span_us = max(BLOCK_US, round(_BLOCK_PERIODS * modulation.period_us))
         self._seen = 0
-        self._window: tuple[int, int] | None = None
+        self.window: tuple[int, int] | None = None
 
     def choose(self, held: HeldEvents, watermark_us: int, last: bool = False) -> int:
         """Return the periods of a profile, 0 while the held events do not give them.
@@ -89,14 +90,14 @@ class ProfileLength:
 
         Where there is none, return what `choose` does.
         """
-        while self._window is None:
+        while self.window is None:
             t, begin = held.arrays[0], self._seen
             window = estimation_window(t[begin:], watermark_us, self._modulation)
             if window is None and not last:
                 return 0
             self._seen = end = t.size if window is None else begin + window.size
             if self._edge_us(held, begin, end) is not None:
-                self._window = begin, end
+                self.window = begin, end
             elif window is None:
                 return 1
             elif end > HELD_EVENTS_MAX:
@@ -113,9 +114,9 @@ class ProfileLength:
 
         Where these have no light, drop the window and return ``None``.
         """
-        assert self._window is not None
+        assert self.window is not None
         t, period_us = held.arrays[0], self._modulation.period_us
-        first, begin = self._window
+        first, begin = self.window
         end_us, periods = int(t[begin - 1]), 0
         block: tuple[Array, NDArray[np.uint16], NDArray[np.uint16]] | None = None
         if last and t[-1] < end_us + self._span_us:
@@ -140,7 +141,7 @@ class ProfileLength:
         if periods > 0 or last:
             return max(periods, 1)
         # The light was on for less than a window.
-        self._seen, self._window = begin, None
+        self._seen, self.window = begin, None
         return None
 
     def _block_end_us(self, t_us: NDArray[np.int64], begin: int, begin_us: int, short: bool) -> int:
@@ -159,7 +160,7 @@ class ProfileLength:
             return None
         sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
         t, x, y, p = (values[sample] for values in held.arrays)
-        phase = estimate_phase(t, p, self._modulation)
+        phase = estimate_phase(t, p, self._modulation, line_rows(x, y).weights)
         return phase.edge_us if phase.found or _is_line(x, y) else None
 
     def _periods(

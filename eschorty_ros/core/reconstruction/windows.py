@@ -75,9 +75,11 @@ class WindowAssembler:
         self._counts: Counter[str] = Counter()
         self._at = Cut(0, 0)
 
-    def restart(self, modulation: Modulation, every: int) -> None:
-        """Drop the open period; further events belong to profiles of ``every`` periods."""
-        self._open.restart(modulation, every)
+    def restart(
+        self, modulation: Modulation, every: int, edge_us: int, first: Arrays | None = None
+    ) -> None:
+        """Drop the open period; see `ProfileAssembler.restart`."""
+        self._open.restart(modulation, every, edge_us, first)
 
     @property
     def has_begun(self) -> bool:
