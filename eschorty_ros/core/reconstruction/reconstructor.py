@@ -127,7 +127,8 @@ class Reconstructor:
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_found=0, points_beyond_pole=0,
-            points_outside_roi=0, points_flagged=0, points_cut=0, columns_compensated=0,
+            points_outside_roi=0, points_flagged=0, points_cut=0, events_used=0,
+            columns_compensated=0,
         )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
@@ -275,6 +276,7 @@ class Reconstructor:
         if self._first_row:
             profiles = replace(profiles, row=profiles.row + self._first_row)
         within = within_ranges(profiles.range_mm, self.settings)
+        self._counts["events_used"] += int(profiles.events.sum())
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
             profiles = profiles.select(within)
@@ -387,7 +389,7 @@ class Reconstructor:
         Of those only ``events_over_column_limit`` and ``events_outside_sensor`` are
         ``events_dropped``: without light there is no phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
-        laser.
+        laser. ``events_used`` are those of the points, of any range.
         ``points_flagged`` are some of ``points_found`` within the limits, which are the ``points``
         unless ``keep`` is good; ``points_cut``, by the sensor's edge, are some of those.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words``,

@@ -19,10 +19,11 @@ _TIME_FAULTS = {
     "decoder_time_high_back": "goes back {}: events have wrong times until it is reached again; "
     "where the camera was started again, make a recording of each start",
 }
-_FEWER_EVENTS = (
+FEWER_EVENTS = (
     "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
     "bias_diff_off)"
 )
+"""What to do where the camera sends too many events."""
 
 
 def decoder_counts(decoder: Counters) -> Counter[str]:
@@ -64,13 +65,13 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
     if counts["sensor_drop_words"]:
         found.append(
             f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
-            f"events, which moves rows where one side of the line is lost; {_FEWER_EVENTS}"
+            f"events, which moves rows where one side of the line is lost; {FEWER_EVENTS}"
         )
     before = counts["decoder_erc_events_in"]
     share = 1.0 - counts["decoder_erc_events_out"] / max(before, 1)
     if before and share > _RATE_CONTROL_SHARE:
         found.append(
-            f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
+            f"the camera's event-rate control drops {share:.0%} of the events; {FEWER_EVENTS}"
         )
     over = counts["events_over_column_limit"] / max(counts["events"], 1)
     share = counts["points_burst_shift"] / max(counts["points_followed"], 1)
@@ -90,11 +91,11 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         found.append(
             f"early and late events of a burst have different rows in {share:.0%} of the "
             "points: the readout loses one side of the line, or the line is asymmetric; sigma "
-            f"has the difference; {_FEWER_EVENTS}"
+            f"has the difference; {FEWER_EVENTS}"
         )
     elif 2 * counts["footprints_asymmetric"] > counts["footprints"]:
         found.append(
             "the mean of the line's rows is not in the middle of its ends: the readout loses one "
-            f"side, or the line is asymmetric; calibrate with this light, or {_FEWER_EVENTS}"
+            f"side, or the line is asymmetric; calibrate with this light, or {FEWER_EVENTS}"
         )
     return found

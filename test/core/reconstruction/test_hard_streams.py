@@ -616,6 +616,15 @@ def test_a_lamp_that_flickers_on_all_pixels_does_not_hide_the_line(lamp_hz, even
     assert not reconstructor.warnings
 
 
+def test_a_lamp_that_hides_the_line_has_a_warning():
+    camera, columns = Camera(periods=12), 128
+    line = camera.line(lambda k, c: np.where(c < columns, wavy(k, c), np.nan))
+    data = stream(line, camera.flickering(100.0, 1.0, columns))
+    _, reconstructor = reconstruct(data, Modulation(70.0), Settings(phase_gate_us=0))
+    print(reconstructor.warnings)
+    assert any("lamps that flicker" in line for line in reconstructor.warnings)
+
+
 def test_a_screen_in_phase_with_the_laser_now_and_then_is_not_taken_for_the_line():
     """It is refreshed at 60 Hz, and in phase with a laser of 70 Hz in every seventh profile."""
     camera = Camera(periods=22)
