@@ -14,8 +14,8 @@ from eschorty_ros.core.storage import Points
 
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
-# Points with less of the events are on other light as often as on the line: nine recordings of ten
-# with more had less than 3 % of such points, those with less 15 % and more.
+# Share of the events below which 15 % of the points and more are on other light, in recordings of
+# three simulators; with more it is 3 % at most.
 _LINE_SHARE = 0.1
 _FEW = 10
 _LOSSES = {
