@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from eschorty_ros.core.modulation.fullest_rows import NEAR_ROWS, fullest_rows
 from eschorty_ros.core.modulation.held_events import Arrays
-from eschorty_ros.core.modulation.line_rows import NEAR_ROWS, line_rows
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, LEAD_US
 
@@ -40,7 +40,7 @@ def background_gate_us(
         return GATE_LEARNED
     stride = max(events[0].size // _SAMPLE, 1)
     t_us, column, row, polarity = (values[::stride] for values in events)
-    cell, near, far_rows = line_rows(column, row)
+    cell, near, far_rows = fullest_rows(column, row)
     if far_rows == 0:
         return GATE_LEARNED
     phase = (t_us - edge_us + LEAD_US) / period_us - modulation.duty * (polarity == 0)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.modulation.edges import EdgeSchedule
+from eschorty_ros.core.modulation.fullest_rows import fullest_rows
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
-from eschorty_ros.core.modulation.line_rows import line_rows
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import (
     PhaseEstimate,
@@ -126,7 +126,7 @@ class PhaseLock:
     def _estimate(self, events: Sequence[NDArray[Any]]) -> PhaseEstimate:
         stride = max(events[0].size // _SAMPLE, 1)
         t_us, column, row, polarity = (values[::stride] for values in events)
-        weights = line_rows(column, row).weights
+        weights = fullest_rows(column, row).weights
         return estimate_phase(t_us, polarity, self._modulation, weights)
 
     def _anchor(self, estimate: PhaseEstimate, first_us: int) -> bool:

@@ -12,8 +12,8 @@ from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.line.blinking import PERIOD_MIN_US
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.fullest_rows import fullest_rows
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
-from eschorty_ros.core.modulation.line_rows import line_rows
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
@@ -160,7 +160,7 @@ class ProfileLength:
             return None
         sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
         t, x, y, p = (values[sample] for values in held.arrays)
-        phase = estimate_phase(t, p, self._modulation, line_rows(x, y).weights)
+        phase = estimate_phase(t, p, self._modulation, fullest_rows(x, y).weights)
         return phase.edge_us if phase.found or _is_line(x, y) else None
 
     def _periods(

@@ -18,7 +18,7 @@ NEAR_ROWS = (2 * _NEAR_CELLS + 1) << _CELL_BITS
 """Rows near the fullest ones."""
 
 
-class LineRows(NamedTuple):
+class FullestRows(NamedTuple):
     """The cell of each event's column, whether its row is near the fullest there, other rows."""
 
     cell: NDArray[np.int64]
@@ -31,11 +31,11 @@ class LineRows(NamedTuple):
         return np.where(self.near, 1.0, -NEAR_ROWS / max(self.far_rows, NEAR_ROWS))
 
 
-def line_rows(column: NDArray[np.uint16], row: NDArray[np.uint16]) -> LineRows:
+def fullest_rows(column: NDArray[np.uint16], row: NDArray[np.uint16]) -> FullestRows:
     """Return where events are; shape (n,), at least one."""
     across = (column >> _CELL_BITS).astype(np.int64)
     along = (row >> _CELL_BITS).astype(np.int64)
     shape = int(across.max()) + 1, int(along.max()) + 1
     counts = np.bincount(across * shape[1] + along, minlength=shape[0] * shape[1]).reshape(shape)
     near = np.abs(along - counts.argmax(axis=1)[across]) <= _NEAR_CELLS
-    return LineRows(across, near, max((shape[1] << _CELL_BITS) - NEAR_ROWS, 0))
+    return FullestRows(across, near, max((shape[1] << _CELL_BITS) - NEAR_ROWS, 0))
