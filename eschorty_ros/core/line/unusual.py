@@ -6,7 +6,8 @@ when few lines of the stream have it for longer than a profile: the width of a l
 crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
 one that changes is compared with the last that was steady, or else with the mode of all. An edge
 leaves one end of the line where it is: where the row does not move with the width, the light has
-changed. Row and width change together from column to column, too, where an edge is oblique.
+changed. Row and width change together from column to column, too, where an edge is oblique, and
+over many profiles where it is slow.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
@@ -24,6 +25,7 @@ from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.line_history import (
     PER_WIDTH,
+    RECENT_PROFILES,
     STEADY,
     STEADY_PROFILES,
     _compare_with_recent,
@@ -73,7 +75,7 @@ class Widths(NamedTuple):
     ``below`` has the sums of the points by width. ``static_width`` holds the widths of a profile
     less what motion adds, ``last`` and ``last_row`` widths and rows of the last one. The
     ``same_width`` has been the same for ``same`` profiles; ``steady``, with ``steady_row``, is the
-    last that was for some.
+    last that was for some. Means over recent profiles are ``recent`` and ``recent_row``.
     """
 
     usual: UsualWidths
@@ -85,6 +87,8 @@ class Widths(NamedTuple):
     same: NDArray[np.float64]
     steady: NDArray[np.float64]
     steady_row: NDArray[np.float64]
+    recent: NDArray[np.float64]
+    recent_row: NDArray[np.float64]
 
 
 def empty_widths(shape: tuple[int, int]) -> Widths:
@@ -99,6 +103,8 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
         same=np.zeros(shape),
         steady=np.full(shape, np.nan),
         steady_row=np.full(shape, np.nan),
+        recent=np.full(shape, np.nan),
+        recent_row=np.full(shape, np.nan),
     )
 
 
@@ -170,6 +176,7 @@ def _restart_widths(widths, known):
     widths.usual.typical.difference = known.typical.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
+    widths.recent[:], widths.recent_row[:] = np.nan, np.nan
     widths.below[:] = 0.0
     _update(widths, widths.last.shape[1])
 
@@ -339,6 +346,28 @@ def _changed_variance(widths, known, k, c, row, sigma_width):
     return (PER_WIDTH * (width - usual)) ** 2 if at_edge else 0.0
 
 
+@kernel(_nrt=False)
+def _slow_edge_variance(widths, k, c, row, sigma_width, moves):
+    """Return the variance of a ``row`` that an edge crosses in many profiles, px squared, else 0.
+
+    Such a row ``moves`` by no more than it scatters from one to the next, but with the width since
+    recent ones. Their means follow both alike.
+    """
+    width, mode = widths.static_width[k, c], widths.usual.typical.mode
+    wider, moved = width - widths.recent[k, c], row - widths.recent_row[k, c]
+    if not abs(moved) < width:
+        # Another surface.
+        widths.recent[k, c], widths.recent_row[k, c] = width, row
+        return 0.0
+    widths.recent[k, c] += wider / RECENT_PROFILES
+    widths.recent_row[k, c] += moved / RECENT_PROFILES
+    unlike = min(abs(wider), mode - width) > STEADY * sigma_width
+    if moves or not unlike:
+        return 0.0
+    share2 = moved * moved / (PER_WIDTH * wider) ** 2
+    return (PER_WIDTH * (width - mode)) ** 2 if 0.25 < share2 < 4.0 else 0.0
+
+
 @kernel
 def _passing_variance(widths, passing2, k, c, sigma_width):
     """Return the variance of a row near an edge that passes its block of columns, px squared.
@@ -364,8 +393,10 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     """
     known, width = _is_known(widths), widths.static_width[k, c]
     edge2 = _changed_variance(widths, known, k, c, smoothing.row[k, c], sigma)
+    slow2 = _slow_edge_variance(widths, k, c, smoothing.row[k, c], sigma, moves)
     if not known:
         return edge2, 1.0
+    edge2 = max(edge2, slow2)
     edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, np.sqrt(WIDTH_COLUMNS) * sigma))
     edge2 = max(edge2, _oblique_variance(smoothing, widths, k, c, sigma))
     if _is_usual(widths.below, width, reach):
