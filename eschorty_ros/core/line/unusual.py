@@ -163,9 +163,10 @@ def _update(widths, columns):
     reach = _reach(WIDTH_COLUMNS, _SIGMA_PER_MEDIAN * typical.difference)
     mode, most = 0, 0.0
     for b in range(_BINS):
-        near = _near(below, b, reach)
-        if near > most:
-            mode, most = b, near
+        if number[b] > 0.0:
+            near = _near(below, b, reach)
+            if near > most:
+                mode, most = b, near
     typical.median, typical.mode = (median + 0.5) / _PER_ROW, (mode + 0.5) / _PER_ROW
 
 
