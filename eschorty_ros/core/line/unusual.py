@@ -352,7 +352,8 @@ def _slow_edge_variance(widths, k, c, row, sigma_width, moves):
     """Return the variance of a ``row`` that an edge crosses in many profiles, px squared, else 0.
 
     Such a row ``moves`` by no more than it scatters from one to the next, but with the width since
-    recent ones, whose means follow both alike. Half of what the width explains, to twice, counts.
+    recent ones: half of what the width explains, to twice, counts. The means of recent widths and
+    rows, which follow both alike, are brought up to date.
     """
     width, mode = widths.static_width[k, c], widths.usual.typical.mode
     wider, moved = width - widths.recent[k, c], row - widths.recent_row[k, c]

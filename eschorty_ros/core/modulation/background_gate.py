@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from eschorty_ros.core.modulation.fullest_rows import NEAR_ROWS, fullest_rows
-from eschorty_ros.core.modulation.held_events import Arrays
+from eschorty_ros.core.modulation.held_events import Arrays, sample
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, LEAD_US
 
@@ -38,8 +38,7 @@ def background_gate_us(
     longest_us = period_us / 4.0
     if modulation.waveform == "sine" or longest_us < LEAD_US:
         return GATE_LEARNED
-    stride = max(events[0].size // _SAMPLE, 1)
-    t_us, column, row, polarity = (values[::stride] for values in events)
+    t_us, column, row, polarity = sample(events, _SAMPLE)
     cell, near, far_rows = fullest_rows(column, row)
     if far_rows == 0:
         return GATE_LEARNED

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.modulation.fullest_rows import fullest_rows
+from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.modulation import Modulation
 
 _WINDOW_PERIODS = 4
@@ -80,6 +82,15 @@ def estimate_phase(
     gap_bins = min(math.ceil(_ROW_US * _HISTOGRAM_BINS / period_us), _GAP_BINS_MAX)
     begin = _burst_begin(phase, weights, gap_bins) if found else 0.0
     return PhaseEstimate(origin + round(begin * period_us), strength, found)
+
+
+def line_phase(events: Arrays, modulation: Modulation) -> PhaseEstimate:
+    """Return a rising edge from the events of lines, without what a lamp adds to them.
+
+    - ``events``: Times, columns, rows and polarities of shape (n,), in time order.
+    """
+    t_us, column, row, polarity = events
+    return estimate_phase(t_us, polarity, modulation, fullest_rows(column, row).weights)
 
 
 def _burst_begin(phase: NDArray[np.float64], weights: NDArray[np.float64], gap_bins: int) -> float:

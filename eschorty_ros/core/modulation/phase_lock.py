@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.modulation.edges import EdgeSchedule
-from eschorty_ros.core.modulation.fullest_rows import fullest_rows
-from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
+from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents, sample
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import (
     PhaseEstimate,
     estimate_phase,
     estimation_window,
+    line_phase,
 )
 
 END_OF_STREAM_US = 1 << 61
@@ -105,7 +102,8 @@ class PhaseLock:
             if window is None:
                 break
             end = begin + window.size
-            estimate = self._estimate([values[begin:end] for values in held.arrays])
+            events = sample([values[begin:end] for values in held.arrays], _SAMPLE)
+            estimate = line_phase(events, self._modulation)
             if estimate.found:
                 self.window = begin, end
                 return self._anchor(estimate, first_us)
@@ -116,18 +114,12 @@ class PhaseLock:
                     return False
                 first_us = int(held.arrays[0][0])
         if last:
-            estimate = self._estimate(held.arrays)
+            estimate = line_phase(sample(held.arrays, _SAMPLE), self._modulation)
             if estimate.found:
                 return self._anchor(estimate, first_us)
             self._ended = True
             held.refuse(len(held))
         return False
-
-    def _estimate(self, events: Sequence[NDArray[Any]]) -> PhaseEstimate:
-        stride = max(events[0].size // _SAMPLE, 1)
-        t_us, column, row, polarity = (values[::stride] for values in events)
-        weights = fullest_rows(column, row).weights
-        return estimate_phase(t_us, polarity, self._modulation, weights)
 
     def _anchor(self, estimate: PhaseEstimate, first_us: int) -> bool:
         self.schedule.anchor(estimate.edge_us, first_us)

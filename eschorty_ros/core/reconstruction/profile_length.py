@@ -12,9 +12,8 @@ from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.line.blinking import PERIOD_MIN_US
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.fullest_rows import fullest_rows
-from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
-from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
+from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents, sample
+from eschorty_ros.core.modulation.phase_estimate import estimation_window, line_phase
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
 _PERIODS_MAX = 1000
@@ -158,10 +157,9 @@ class ProfileLength:
         """Return an edge of the laser that held events follow, or are on a line; else none."""
         if begin == end:
             return None
-        sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
-        t, x, y, p = (values[sample] for values in held.arrays)
-        phase = estimate_phase(t, p, self._modulation, fullest_rows(x, y).weights)
-        return phase.edge_us if phase.found or _is_line(x, y) else None
+        events = sample([values[begin:end] for values in held.arrays], _SAMPLE)
+        phase = line_phase(events, self._modulation)
+        return phase.edge_us if phase.found or _is_line(*events[1:3]) else None
 
     def _periods(
         self, turns: Array, columns: NDArray[np.uint16], rows: NDArray[np.uint16], enough: int
