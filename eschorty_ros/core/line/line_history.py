@@ -14,7 +14,8 @@ displacement has none, nor has a single jump to another surface.
 A line that gets narrower or wider for a few profiles passes an edge, and is off by half of the rows
 that are missing, or new, at most. Means over blocks show changes that are too small to be seen in a
 column. Stripes change the mean width of recent profiles, too: the last width that was steady shows
-their edges.
+their edges. At an edge the row moves with the width: what does not, or moves by far more, is light
+that changes, or a surface that slopes.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ STEADY_PROFILES = 2.0
 # Most that an edge moves the row per change of the width of evenly lit rows: by half of those that
 # are missing, or by half of those that are new.
 PER_WIDTH = np.sqrt(3.0)
+# A row that moves by so many times what the width explains is that of a line that moves.
+_MOVES = 8.0
 
 
 class BlockSums(NamedTuple):
@@ -59,20 +62,23 @@ class BlockSums(NamedTuple):
 class BlockMeans(NamedTuple):
     """Mean row and width of recent profiles by block, and the number of these profiles.
 
+    The ``width_row`` is the mean of rows that follow as slowly as the ``width`` does at an edge.
     The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
     ``jitter2`` the variance of rows that jump back and forth. The ``same_width`` has been the same
     for ``same`` profiles; ``steady_width``, of ``before`` profiles ago, is the last that was for
-    some.
+    some, and ``steady_row`` the row then, NaN on another surface.
     """
 
     row: NDArray[np.float64]
     width: NDArray[np.float64]
+    width_row: NDArray[np.float64]
     profiles: NDArray[np.float64]
     last: NDArray[np.float64]
     difference: NDArray[np.float64]
     jitter2: NDArray[np.float64]
     same_width: NDArray[np.float64]
     steady_width: NDArray[np.float64]
+    steady_row: NDArray[np.float64]
     same: NDArray[np.float64]
     before: NDArray[np.float64]
 
@@ -113,7 +119,7 @@ def empty_history(columns: int, windowed: bool) -> LineHistory:
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((10, blocks)))
+    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((12, blocks)))
     polarities = PolarityMeans(*np.zeros((3, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(now, recent, polarities, step_px, shift_px, moved2, passing2, windowed)
@@ -188,9 +194,22 @@ def _same_for(width, mean, profiles, sigma):
     return mean + (width - mean) / (profiles + 1.0), profiles + 1.0
 
 
+@kernel
+def _changed_at_edge(changed, moved):
+    """Return by how much an edge has ``changed`` a width, as far as the row has ``moved`` with it.
+
+    That is up to twice what the row explains, as rows and widths are smoothed differently. A row of
+    another surface, NaN, does not show it.
+    """
+    explained = abs(moved) / PER_WIDTH
+    if explained > _MOVES * changed:
+        return 0.0
+    return changed if np.isnan(explained) else min(changed, 2.0 * explained)
+
+
 @kernel(_nrt=False)
-def _changed_since_steady(recent, block, width, width2):
-    """Return by how much the width differs from the last one that was the same for some profiles.
+def _changed_since_steady(recent, block, row, width, width2):
+    """Return by how much an edge has changed the last width that was the same for some profiles.
 
     ``width2`` is the variance of a block's mean width.
     """
@@ -198,10 +217,14 @@ def _changed_since_steady(recent, block, width, width2):
         width, recent.same_width[block], recent.same[block], np.sqrt(width2)
     )
     recent.before[block] += 1.0
+    if abs(row - recent.last[block]) > width:
+        recent.steady_row[block] = np.nan
     if recent.same[block] > STEADY_PROFILES:
         recent.steady_width[block], recent.before[block] = recent.same_width[block], 0.0
+        recent.steady_row[block] = row
     known = recent.steady_width[block] > 0.0 and recent.before[block] <= RECENT_PROFILES
-    return abs(width - recent.steady_width[block]) if known else 0.0
+    changed = abs(width - recent.steady_width[block]) if known else 0.0
+    return _changed_at_edge(changed, row - recent.steady_row[block])
 
 
 @kernel(_nrt=False)
@@ -259,15 +282,18 @@ def _jitter_variance(recent, block, row, own2, weight, alike):
 
 
 @kernel(_nrt=False)
-def _edge_variance(recent, block, width, width2, known, usual):
+def _edge_variance(recent, block, row, width, width2, known, usual):
     """Return the variance of rows near an edge that passes, px squared; 0 while none is ``known``.
 
     A line that has its ``usual`` width again for some profiles has passed the edge. ``width2`` is
     the variance of the block's mean ``width``.
     """
     least, most = min(recent.width[block], usual), max(recent.width[block], usual)
-    since_steady = _changed_since_steady(recent, block, width, width2)
-    changed = max(least - width, width - most, since_steady) if known else 0.0
+    since_steady = _changed_since_steady(recent, block, row, width, width2)
+    moved = row - recent.width_row[block]
+    moved = moved if abs(moved) < width else np.nan
+    recently = _changed_at_edge(max(least - width, width - most), moved)
+    changed = max(recently, since_steady) if known else 0.0
     return max(PER_WIDTH**2 * (changed * changed - width2), 0.0)
 
 
@@ -287,7 +313,7 @@ def _compare_with_recent(history, known, usual, width_variance):
             continue
         row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points
         own2, width2 = _near_sum(now.sigma2, block) / (points * points), width_variance / points
-        history.passing2[block] = _edge_variance(recent, block, width, width2, known, usual)
+        history.passing2[block] = _edge_variance(recent, block, row, width, width2, known, usual)
         profiles = min(recent.profiles[block] + 1.0, RECENT_PROFILES)
         # The first profiles, of pixels just lit, soon count little.
         weight = 2.0 / (profiles + 1.0)
@@ -300,7 +326,10 @@ def _compare_with_recent(history, known, usual, width_variance):
             limit = RECENT_PROFILES / profiles * np.sqrt(width2) if known else limit
         recent.last[block], recent.profiles[block] = row, profiles
         recent.row[block] += weight * (row - recent.row[block])
-        recent.width[block] += weight * max(min(width - recent.width[block], limit), -limit)
+        wider = width - recent.width[block]
+        weight *= min(limit / abs(wider), 1.0) if wider != 0.0 else 1.0
+        recent.width[block] += weight * wider
+        recent.width_row[block] += weight * (row - recent.width_row[block])
 
 
 @kernel(_nrt=False)

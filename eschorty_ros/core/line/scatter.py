@@ -242,6 +242,17 @@ def _left_of_locking(row, used, column):
     return 1.0 if np.isnan(way) else 1.0 / (1.0 + x2 / 3.0 + x2 * x2 / 15.0)
 
 
+@kernel
+def _share_at(row, locking2):
+    """Return the variance of whole pixels at a ``row`` over its mean ``locking2``.
+
+    A line in the middle of a pixel, or between two, is off by nothing: the error is a sine, whose
+    amplitude is how far off the row may be itself.
+    """
+    share = np.exp(-16.0 * np.pi**2 * locking2) * np.cos(4.0 * np.pi * row)
+    return 1.0 if np.isnan(share) else 1.0 - share
+
+
 @kernel(_nrt=False)
 def _scale_smoothed(rows, scatter, smoothing):
     """Scale the smoothed variances of a profile by the scatter left.
@@ -255,13 +266,13 @@ def _scale_smoothed(rows, scatter, smoothing):
     _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _FAR_APART, far)
     for block in range(1, near.number.size - 1):
         ratio = _smoothed_ratio(scatter, block)
-        factor = min(ratio, scatter.factor_max)
+        factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         for k in range(returns):
-            left2 = _left_of_locking(smoothing.row[k], smoothing.used[k], (begin + end) // 2)
-            locking2 = left2 * scatter.levels.variance[block]
+            middle, locking2 = np.uintp((begin + end) // 2), scatter.levels.variance[block]
+            locking2 *= _left_of_locking(smoothing.row[k], smoothing.used[k], middle)
+            locking2 *= _share_at(smoothing.row[k, middle], locking2)
             for c in range(np.uintp(begin), np.uintp(end)):
                 rows.common2[k, c] += 0.0 if rows.truncated[k, c] else locking2
-                own2, common2 = sigma2[k, c], rows.common2[k, c]
-                measured2 = max(common2, factor * own2)
-                sigma2[k, c] = measured2 if ratio >= 0.0 else common2 + own2
+                own2, common2 = factor * sigma2[k, c], rows.common2[k, c]
+                sigma2[k, c] = max(common2, own2) if ratio >= 0.0 else common2 + own2

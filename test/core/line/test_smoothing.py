@@ -93,8 +93,8 @@ def test_the_columns_own_variance_averages_out_and_the_shared_one_stays(half_wid
     np.testing.assert_array_equal(out, row)
     expected = np.sqrt(alone2 - own2 + own2 / (2 * half_width + 1))
     assert sigma[8] == pytest.approx(expected, rel=1e-12)
-    # Of whole pixels.
-    assert alone2 - own2 == pytest.approx(1 / 12)
+    # Of whole pixels, less what is known of where the row is in its pixel.
+    assert alone2 - own2 == pytest.approx((1.0 - np.exp(-16.0 * np.pi**2 / 12.0)) / 12.0)
 
 
 @pytest.mark.parametrize("scatter_px", [0.3, 0.6])
