@@ -327,7 +327,7 @@ def _compare_with_recent(history, known, usual, width_variance):
         recent.last[block], recent.profiles[block] = row, profiles
         recent.row[block] += weight * (row - recent.row[block])
         wider = width - recent.width[block]
-        weight *= min(limit / abs(wider), 1.0) if wider != 0.0 else 1.0
+        weight *= limit / abs(wider) if abs(wider) > limit else 1.0
         recent.width[block] += weight * wider
         recent.width_row[block] += weight * (row - recent.width_row[block])
 
