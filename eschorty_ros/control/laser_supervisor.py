@@ -354,6 +354,9 @@ class LaserSupervisor:
     def _read_and_compare(self, laser: LaserModulator, ticket: int) -> None:
         try:
             readback = laser.readback()
+        except VoidedError:
+            # The guard has disabled the output; the next read-back says why.
+            return
         except Exception as error:
             # Disabling may be what interrupted the read-back.
             if not self._in_flight.is_void(ticket) and self.trip(f"not read back: {error}"):

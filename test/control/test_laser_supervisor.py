@@ -1,5 +1,6 @@
 """Commands, disabling and the generator's answers that cross each other."""
 
+import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
+from eschorty_ros.hardware.laser.in_flight import VoidedError
 
 
 @pytest.fixture
@@ -29,9 +31,10 @@ def opened(
     laser: DelayedLaser,
     interlock: LaserInterlock,
     publish: Callable[[LaserStatus], None] = lambda status: None,
+    alarm: Callable[[str], None] = print,
 ) -> LaserSupervisor:
     made = LaserSupervisor(
-        interlock, running=lambda: True, publish=publish, alarm=print, log=print,
+        interlock, running=lambda: True, publish=publish, alarm=alarm, log=print,
         readback_period_s=0.02,
     )  # fmt: skip
     interlock.receive_heartbeat()
@@ -285,6 +288,29 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(superv
     enabling.join()
     assert failures == ["switched off meanwhile"]
     assert supervisor.status().reason == "interlock open"
+
+
+class DisabledByGuard(DelayedLaser):
+    """With ``delayed`` a read-back ends as the guard disables the output."""
+
+    def readback(self) -> LaserReadback:
+        if self.delayed:
+            self.delayed, self.lit = "", False
+            raise VoidedError("laser refused: switched off meanwhile")
+        return dataclasses.replace(super().readback(), reason="process 1 is stopped")
+
+
+def test_a_read_back_that_the_guard_interrupts_is_no_failure_of_the_laser() -> None:
+    laser, alarms = DisabledByGuard(), []
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, alarm=alarms.append)
+    arm(supervisor)
+    enable(supervisor)
+    laser.delayed = "readback"
+    wait_until(lambda: supervisor.status().requested is LaserOutput.OFF, "the laser disabled")
+    supervisor.close()
+    assert supervisor.switch_offs == 1
+    assert alarms == []
 
 
 def test_closing_disables_before_it_waits_for_a_check(laser, monkeypatch):

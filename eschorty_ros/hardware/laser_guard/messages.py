@@ -16,8 +16,10 @@ from eschorty_ros.core.base import errors
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
+from eschorty_ros.hardware.laser.in_flight import VoidedError
 
 MESSAGE_MAX_BYTES = 65536
+_ERRORS = {**vars(errors), VoidedError.__name__: VoidedError}
 
 Message = dict[str, Any]
 
@@ -66,7 +68,7 @@ def failure_message(error: Exception) -> Message:
 def raise_failure(message: Message) -> None:
     """Raise the error that a message carries, if it carries one."""
     if "error" in message:
-        raise getattr(errors, message["error"], DeviceError)(message["text"])
+        raise _ERRORS.get(message["error"], DeviceError)(message["text"])
 
 
 def readback_from(message: Message) -> LaserReadback:

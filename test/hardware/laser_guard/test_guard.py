@@ -27,6 +27,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base import stalls
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser.awg_settings import GRANT_MAX_S
+from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser_guard import guard, guarded
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.hardware.laser_guard.messages import Wire
@@ -471,7 +472,7 @@ def test_disabling_interrupts_a_read_back(awg: AwgProcess, tmp_path: Path) -> No
         asked_ns = time.monotonic_ns()
         laser.disable()
         check_off(awg.off_after_s(asked_ns))
-        with pytest.raises(DeviceError, match="switched off meanwhile"):
+        with pytest.raises(VoidedError, match="switched off meanwhile"):
             reading.result()
 
 
