@@ -336,6 +336,7 @@ class Motion:
     ended_by_message: bool = False
     _seen_moving: bool = False
     _resting: int = 0
+    _late: int = 0
     _wrong_since_ns: int | None = None
 
     @property
@@ -371,7 +372,9 @@ class Motion:
             return Outcome.MET_LIMIT
         if self._resting >= _READINGS_AT_REST and self._is_complete(status, arrived):
             return Outcome.ENDED
-        if not_before_ns > self.deadline_ns:
+        self._late += not_before_ns > self.deadline_ns
+        # After a stall of the host the first late readings show whether the stage rests.
+        if self._late > _READINGS_AT_REST:
             return Outcome.LATE
         if self.kind is Kind.STOP:
             return Outcome.GOING

@@ -354,6 +354,17 @@ def test_a_stall_as_a_move_begins_is_no_failure(bench: AptBench) -> None:
         assert bench.stage.state().position_mm == pytest.approx(target_mm, abs=1e-4)
 
 
+@pytest.mark.fault("host stalls")
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_stall_beyond_the_end_of_a_move_is_no_failure(moving: AptBench, stopped: bool) -> None:
+    """driver: reads whether the stage rests before it is late; user reads: nothing."""
+    if stopped:
+        moving.stage.stop()
+    stall(moving, 10.0)
+    moving.until(lambda: not moving.stage.state().moving, 2.0)
+    assert moving.stage.healthy
+
+
 @pytest.mark.fault("shutdown at any time")
 def test_close_while_homing_stops_the_carriage() -> None:
     """driver: stops and closes within 2 s, twice if need be; user reads: nothing."""
