@@ -18,6 +18,8 @@ _STALE_S = 3.5
 # A laser reports nothing during a command.
 _REPORT_TIMEOUT_S = 2.5
 _REST_MM_S = 0.1
+# A stage ends its move after some more readings at rest, and refuses the next one until then.
+_MOVE_ENDS_S = 0.3
 # A stage needs some seconds to begin a move, and longer on a busy computer.
 _MOTION_S = 15.0
 _HEARTBEAT_S = 3.0
@@ -67,7 +69,8 @@ class InstrumentMonitor:
         self.laser: LaserReport | None = None
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = math.nan
-        self.at_rest = False
+        self._rests = False
+        self._in_motion_s = -math.inf
         self.until_ns = 0
         self._reported_s = dict.fromkeys(("laser", "stage", "reconstruction"), 0.0)
         self._advanced_s = self._moved_s = 0.0
@@ -102,7 +105,9 @@ class InstrumentMonitor:
         self.position_mm = position_mm
         self._reported_s["stage"] = now_s
         self._ages["stage"].add(age_s)
-        self.at_rest = abs(velocity_mm_s) < _REST_MM_S
+        self._rests = abs(velocity_mm_s) < _REST_MM_S
+        if not self._rests:
+            self._in_motion_s = now_s
         # Those of the motion before may still come.
         if t_ns >= self._samples_from_ns:
             self.samples.append((t_ns, position_mm))
@@ -126,6 +131,11 @@ class InstrumentMonitor:
     def output(self) -> int | None:
         """Return the output that the laser reads back, ``None`` before its first status."""
         return self.laser.output if self.laser is not None else None
+
+    @property
+    def at_rest(self) -> bool:
+        """Return whether the stage rests and its move has had time to end."""
+        return self._rests and _age_s(self._in_motion_s) > _MOVE_ENDS_S
 
     @property
     def stage_reports(self) -> bool:

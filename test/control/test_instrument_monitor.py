@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 from eschorty_ros.control.heartbeat import place
 from eschorty_ros.control.instrument_monitor import (
@@ -78,6 +79,15 @@ def test_a_slow_drain_goes_on_while_the_rest_takes_no_longer_than_the_limit():
     waiting.prepare(lambda: False, advance)
     waiting.drain(10.0, 1.0)
     assert subject.until_ns == 10**18
+
+
+def test_a_stage_is_at_rest_when_its_move_has_had_time_to_end():
+    subject = monitor()
+    assert subject.at_rest
+    subject.update_stage(2, 10.0, 5.0, 0.0)
+    subject.update_stage(3, 10.0, 0.0, 0.0)
+    assert not subject.at_rest
+    wait_until(lambda: subject.at_rest, "the stage at rest")
 
 
 def test_the_progress_is_where_the_stage_was_at_the_newest_event():
