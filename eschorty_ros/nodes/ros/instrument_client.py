@@ -141,6 +141,8 @@ class InstrumentClient(PacedWaiting):
     def check_nodes(self) -> None:
         """Raise ``ScanFailure`` that names the component that does not answer."""
         begun_ns = self.monitor.until_ns
+        for state in self._states.values():
+            state.forget()
         end_s = time.monotonic() + self._node_timeout_s
         for holds, failure in self._needed(begun_ns):
             self.wait(holds, max(end_s - time.monotonic(), _LEAST_WAIT_S), failure)
@@ -394,15 +396,19 @@ def end_goal(goal: Any, end: End) -> None:
 
 
 class _LifecycleState:
-    """The state of a lifecycle node, asked for again and again; one without it counts as active."""
+    """The state of a lifecycle node, requested repeatedly; one without it counts as active."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         self._call: RepeatedCall | None = None
         self._active = False
 
+    def forget(self) -> None:
+        """Wait for a new answer: the last one may be old."""
+        self._call, self._active = None, False
+
     def active(self) -> bool:
-        """Return whether the last answer was ``active``; ask again."""
+        """Return whether the last answer was ``active``; request the next one."""
         if not self._client.service_is_ready():
             return True
         if self._call is None:

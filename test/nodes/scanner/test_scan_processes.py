@@ -52,6 +52,15 @@ def test_full_scan(bench):
     scenarios.full_scan(bench)
 
 
+def test_a_scan_waits_for_a_stage_that_has_been_deactivated(bench):
+    assert bench.observer.change_state("stage", "deactivate")
+    bench.start()
+    bench.scans.wait_for(lambda f: "stage: its node is not active" in f.waits_for, "the reason")
+    assert bench.observer.change_state("stage", "activate")
+    status, result = bench.scans.end()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+
+
 def test_a_canceled_scan_keeps_the_points_so_far(bench):
     """Cancel in the middle: light off, stage stopped, what there is published."""
     before = len(bench.clouds)
