@@ -31,7 +31,12 @@ _HIDDEN = "/_action/"
 # What a node makes when it is needed.
 _LIGHT: dict[tuple[str, str], set[str]] = {
     ("actions", "call"): {"calibrate"},
-    ("topics", "subscribe"): {"reconstruction/state", "reconstruction/heartbeat", "stage/limits"},
+    ("topics", "subscribe"): {
+        "laser/transition_event",
+        "reconstruction/state",
+        "reconstruction/heartbeat",
+        "stage/limits",
+    },
 }
 ON_DEMAND = {"reconstruction": _LIGHT, "scanner": {("actions", "call"): {"scan"}}}
 

@@ -58,6 +58,7 @@ class InstrumentMonitor:
 
     Public attributes:
     - ``limits``: The stage's, ``None`` before they come.
+    - ``laser_failed``: Whether the laser's node has failed since the newest status.
     - ``samples``: ROS time (ns) and stage position (mm) since ``restart_samples``; none before.
     """
 
@@ -67,6 +68,7 @@ class InstrumentMonitor:
         self._samples_from_ns = math.inf
         self.limits: StageLimits | None = None
         self.laser: LaserReport | None = None
+        self.laser_failed = False
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = math.nan
         self._rests = False
@@ -83,6 +85,8 @@ class InstrumentMonitor:
     def update_laser(self, status: LaserReport, age_s: float) -> None:
         """Store the laser's newest status, which arrived ``age_s`` after its stamp."""
         self.laser, self._reported_s["laser"] = status, time.monotonic()
+        # One that was started again may be discovered after it has been configured.
+        self.laser_failed = False
         self._ages["laser"].add(age_s)
 
     def update_reconstruction(self, status: ReconstructionStatus, age_s: float) -> None:
@@ -193,10 +197,10 @@ class InstrumentMonitor:
         if self.laser.output != LaserOutput.ON:
             raise ScanFailure(f"laser: went off: {self.laser.reason}")
 
-    def check_laser_known(self) -> None:
-        """Raise ``ScanFailure`` with the laser's reason when its output may be on or off."""
-        if self.laser_reports and self.output == LaserOutput.UNKNOWN:
-            assert self.laser is not None
+    def check_laser_works(self) -> None:
+        """Raise ``ScanFailure`` with the laser's reason when it has failed or may be on or off."""
+        unknown = self.laser_reports and self.output == LaserOutput.UNKNOWN
+        if self.laser is not None and (self.laser_failed or unknown):
             raise ScanFailure(f"laser: {self.laser.reason.removeprefix('laser ')}")
 
     def cause_of_no_progress(self) -> str:

@@ -128,8 +128,8 @@ class PacedWaiting:
             self.monitor.check_reconstruction()
             self.monitor.check_progress(self._events_timeout_s)
         if not self._shielded:
-            # Such a laser has failed: it gives no light until it is configured again.
-            self.monitor.check_laser_known()
+            # One that has failed gives no light until it is configured again.
+            self.monitor.check_laser_works()
             if self._canceled():
                 raise ScanCanceled
         time.sleep(_TICK_S)

@@ -39,6 +39,16 @@ def test_late_messages_beside_a_prompt_one_are_no_clock_of_another_time():
     late.check_clocks()
 
 
+def test_a_laser_that_reports_again_has_not_failed():
+    subject = monitor()
+    subject.update_laser(LaserReport(0, 70.0, 0.5, "not read back"), 0.0)
+    subject.laser_failed = True
+    with pytest.raises(ScanFailure, match="laser: not read back"):
+        subject.check_laser_works()
+    subject.update_laser(LaserReport(0, 70.0, 0.5, ""), 0.0)
+    subject.check_laser_works()
+
+
 def test_the_end_of_the_reconstruction_is_found_by_its_process():
     subject = monitor()
     subject.check_reconstruction()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar
 
 from action_msgs.msg import GoalStatus
+from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
@@ -429,6 +430,9 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
             age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
+    def on_laser_node(message: TransitionEvent) -> None:
+        monitor.laser_failed = message.start_state.label == "errorprocessing"
+
     def on_reconstruction(message: ReconstructionState, info: Mapping[str, Any]) -> None:
         reconstruction.check(info)
         monitor.update_reconstruction(
@@ -469,6 +473,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
     group = ShortGroup()
     for kind, topic_name, callback, profile in (
         (LaserState, "laser/state", on_laser, qos.latched(qos.STATE_HISTORY)),
+        (TransitionEvent, "laser/transition_event", on_laser_node, 10),
         (ReconstructionState, "reconstruction/state", on_reconstruction, 10),
         (Odometry, "stage/odom", on_stage, qos.stream()),
         (StageLimitsMessage, "stage/limits", on_limits, qos.latched()),

@@ -44,12 +44,12 @@ def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(observer, 
 
 
 class Lost(DelayedLaser):
-    """Cannot be reached once it is ``gone``."""
+    """Reads nothing back once it is ``gone``; switches off all the same if ``confirmed``."""
 
-    gone = False
+    gone = confirmed = False
 
     def disable(self):
-        if self.gone:
+        if self.gone and not self.confirmed:
             raise DeviceError("switch the generator off by hand")
         super().disable()
 
@@ -59,10 +59,18 @@ class Lost(DelayedLaser):
         return super().readback()
 
 
+@pytest.mark.parametrize(
+    ("confirmed", "reason"),
+    [
+        (False, "state unknown: switch the generator off by hand"),
+        (True, "not read back: no answer"),
+    ],
+)
 def test_a_laser_that_has_failed_ends_the_scan_at_once_with_its_reason(
-    observer, start, monkeypatch
+    observer, start, monkeypatch, confirmed, reason
 ):
     laser = Lost()
+    laser.confirmed = confirmed
     monkeypatch.setattr(drivers, "make", lambda *_: laser)
     goals = scans(observer, start)
     start(LaserNode)
@@ -72,6 +80,6 @@ def test_a_laser_that_has_failed_ends_the_scan_at_once_with_its_reason(
     begun_s = time.monotonic()
     goals.start(**GOAL)
     _, result = goals.end()
-    assert result.message == "laser: state unknown: switch the generator off by hand"
+    assert result.message == f"laser: {reason}"
     assert time.monotonic() - begun_s < 10.0
     laser.gone = False
