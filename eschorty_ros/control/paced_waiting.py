@@ -56,7 +56,7 @@ class PacedWaiting:
         """Reset for a new sequence; both callables are used at every tick."""
         self._canceled, self._feedback = canceled, feedback
         self._watching = self._shielded = False
-        self._phase = "preparing"
+        self._phase, self.waits_for = "preparing", ""
 
     def end(self) -> None:
         """Make every wait fail from now on."""

@@ -70,7 +70,7 @@ _BEGIN_S = 20.0
 _LATE_NODE_WAIT_S = 0.3
 _LEAST_WAIT_S = 0.1
 _CLOCKS_S = 20.0
-_ENABLE_AGAIN_S = 0.25
+_ENABLE_RETRY_S = 0.25
 
 
 class InstrumentClient(PacedWaiting):
@@ -154,11 +154,15 @@ class InstrumentClient(PacedWaiting):
         end_s = time.monotonic() + _CLOCKS_S
         while True:
             try:
-                return self.monitor.check_clocks()
-            except ScanFailure:
+                self.monitor.check_clocks()
+            except ScanFailure as failure:
                 if time.monotonic() > end_s:
                     raise
-            self.tick()
+                self.waits_for = str(failure)
+                self.tick()
+            else:
+                self.waits_for = ""
+                return
 
     def missing(self) -> str:
         """Return the missing conditions, one of each node; ``""`` when a sequence can begin."""
@@ -258,8 +262,8 @@ class InstrumentClient(PacedWaiting):
             if _HEARTBEAT not in refusal or time.monotonic() > ends_s:
                 raise ScanFailure(refusal)
             self.waits_for = refusal
-            again_s = time.monotonic() + _ENABLE_AGAIN_S
-            while time.monotonic() < again_s:
+            retry_s = time.monotonic() + _ENABLE_RETRY_S
+            while time.monotonic() < retry_s:
                 self.tick()
         self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
                   "laser: its output does not read back on")  # fmt: skip

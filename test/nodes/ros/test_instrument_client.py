@@ -75,6 +75,22 @@ def test_a_scan_left_open_that_ends_meanwhile_does_not_fail_the_next():
     client.begin_scan(ScanRequest("s", 20.0, 40.0, 50.0, 70.0))
 
 
+def test_a_clock_that_seems_to_be_of_another_time_is_named_in_the_feedback():
+    client, waits = CanceledClient(canceled=False), []
+    client._states, client._node_timeout_s, client._needed = {}, 5.0, lambda begun_ns: []
+    client.monitor.update_stage(1, 10.0, 0.0, 0.9)
+
+    def later(phase):
+        waits.append(client.waits_for)
+        client.monitor.update_stage(2, 10.0, 0.0, 0.01)
+
+    client._feedback = later
+    client.check_nodes()
+    assert len(waits) == 1
+    assert waits[0].startswith("stage: its stamps are 0.900 s behind")
+    assert client.waits_for == ""
+
+
 def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
     reason = "laser refused: camera/heartbeat reports stopped; look at the camera node"
     client, refusals, waits = CanceledClient(canceled=False), [reason, reason, ""], []
