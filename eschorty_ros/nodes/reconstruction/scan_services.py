@@ -194,7 +194,12 @@ class ScanServices:
             return response
         if not self._awaited(finished, end_s):
             response.success = False
-            response.message = "the scan was not assembled in time; see the node's log"
+            response.message = (
+                f"scan {request.scan_id!r} is not assembled after {self._timeout_s:g} s, its "
+                "points come on scan/points later; look at the computer's load"
+                if self._running()
+                else "the node was shut down"
+            )
             return response
         report = reports[0]
         response.profiles = saturated(report.scan.profiles, UINT32_MAX)
