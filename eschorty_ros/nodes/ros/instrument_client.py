@@ -300,12 +300,14 @@ class InstrumentClient(PacedWaiting):
         self._await(future.done, name, self._service_timeout_s)
         return future.result()
 
-    def _await(self, answered: Callable[[], bool], name: str, timeout_s: float) -> None:
+    def _await(
+        self, answered: Callable[[], bool], name: str, timeout_s: float, failure: str = ""
+    ) -> None:
         """Wait for an answer; only shortly for one of a node that no longer reports."""
         component = name.split("/")[0]
         if self.monitor.report_late(component):
             timeout_s = _LATE_NODE_WAIT_S
-        self.wait(answered, timeout_s, f"{component}: no answer of {name}")
+        self.wait(answered, timeout_s, failure or f"{component}: no answer of {name}")
 
     def _call(
         self,
@@ -313,8 +315,12 @@ class InstrumentClient(PacedWaiting):
         request: Any,
         timeout_s: float | None = None,
         repeat: bool = True,
+        failure: str = "",
     ) -> Any:
-        """Return a service's answer; with ``repeat`` a request without one is sent again."""
+        """Return a service's answer; with ``repeat`` a request without one is sent again.
+
+        ``failure`` is named in place of the lack of an answer.
+        """
         call = RepeatedCall(self._clients[name], request, again=repeat)
 
         def answered() -> bool:
@@ -323,7 +329,7 @@ class InstrumentClient(PacedWaiting):
             with self._shutdown_as_failure():
                 return call.done()
 
-        self._await(answered, name, timeout_s or self._service_timeout_s)
+        self._await(answered, name, timeout_s or self._service_timeout_s, failure)
         return call.result()
 
     @contextlib.contextmanager
@@ -368,16 +374,20 @@ class ScanClient(InstrumentClient):
             passes=request.passes,
         )
         self.monitor.restart_samples(self._now_ns())
-        ends_s = time.monotonic() + _DEAD_S
-        while not (answer := self._begun(begin)).success:
+        ends_s, refusal = time.monotonic() + _DEAD_S, ""
+        while not (answer := self._begun(begin, refusal)).success:
+            refusal = f"reconstruction: {answer.message}"
             if not answer.retry or time.monotonic() > ends_s:
-                raise ScanFailure(f"reconstruction: {answer.message}")
+                raise ScanFailure(refusal)
             self.tick()
 
-    def _begun(self, begin: Any) -> Any:
-        """Return the answer; a cancel before it would leave a scan that is never ended."""
+    def _begun(self, begin: Any, refusal: str) -> Any:
+        """Return the answer; a cancel before it would leave a scan that is never ended.
+
+        ``refusal`` is the one before, which the feedback names meanwhile.
+        """
         with self.shielded():
-            return self._call("reconstruction/begin_scan", begin, _BEGIN_S)
+            return self._call("reconstruction/begin_scan", begin, _BEGIN_S, failure=refusal)
 
     def end_scan(self, scan_id: str) -> ScanSummary:
         """Publish the points collected."""

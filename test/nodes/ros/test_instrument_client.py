@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from eschorty_ros.control import paced_waiting
 from eschorty_ros.control.instrument_monitor import InstrumentMonitor
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure, ScanRequest
@@ -52,13 +53,17 @@ def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects(
 
 
 @pytest.mark.parametrize("retry", [True, False])
-def test_a_scan_that_is_refused_begins_later_if_the_reason_may_pass(retry):
+def test_a_scan_that_is_refused_begins_later_if_the_reason_may_pass(monkeypatch, retry):
     refused = SimpleNamespace(success=False, message="odom has 2 publishers", retry=retry)
     taken = SimpleNamespace(success=True, message="")
     client = CanceledClient(refused, refused, taken, canceled=False)
     request = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
     if retry:
+        monkeypatch.setattr(paced_waiting, "_NOTED_S", 0.0)
+        waits = set()
+        client._feedback = lambda phase: waits.add(client.waits_for)
         client.begin_scan(request)
+        assert "reconstruction: odom has 2 publishers" in waits
     else:
         with pytest.raises(ScanFailure, match="has 2 publishers"):
             client.begin_scan(request)
