@@ -234,7 +234,8 @@ class InstrumentClient(PacedWaiting):
         self._sent = None
         answer = future.result()
         if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:
-            raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
+            reason = answer.result.message.removeprefix("stage ") or "the move did not succeed"
+            raise ScanFailure(f"stage: {reason}")
 
     def stop_stage(self) -> None:
         """End a move under way and wait until the stage rests."""

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+from action_msgs.msg import GoalStatus
 
 from eschorty_ros.control import paced_waiting
 from eschorty_ros.control.instrument_monitor import InstrumentMonitor
@@ -78,6 +79,17 @@ def test_a_scan_left_open_that_ends_meanwhile_does_not_fail_the_next():
         call_async=lambda request: Answered(ended, 3)
     )
     client.begin_scan(ScanRequest("s", 20.0, 40.0, 50.0, 70.0))
+
+
+def test_a_refusal_of_the_stage_names_it_once():
+    client = CanceledClient(canceled=False)
+    result = SimpleNamespace(success=False, message="stage refused: node is inactive")
+    ended = Answered(SimpleNamespace(status=GoalStatus.STATUS_ABORTED, result=result), 1)
+    handle = SimpleNamespace(accepted=True, get_result_async=lambda: ended)
+    client._stage = SimpleNamespace(send_goal_async=lambda goal: Answered(handle, 0))
+    client.monitor.update_stage(1, 10.0, 0.0, 0.0)
+    with pytest.raises(ScanFailure, match=r"^stage: refused: node is inactive$"):
+        client.move(10.0, 5.0)
 
 
 def test_a_clock_that_seems_to_be_of_another_time_is_named_in_the_feedback():
