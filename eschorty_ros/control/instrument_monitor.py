@@ -162,7 +162,7 @@ class InstrumentMonitor:
     def check_stage(self) -> None:
         """Raise ``ScanFailure`` when odometry stopped."""
         if not self.stage_reports:
-            raise ScanFailure(f"stage: no odometry for {_STALE_S:g} s")
+            raise ScanFailure(f"stage: no odometry for {_STALE_S:g} s; check that its node runs")
 
     def check_motion(self, begun_s: float) -> None:
         """Raise ``ScanFailure`` when a move that began then has ended without a result."""
@@ -193,7 +193,7 @@ class InstrumentMonitor:
     def check_laser(self) -> None:
         """Raise ``ScanFailure`` when the laser does not report or is not on."""
         if self.laser is None or not self.laser_reports:
-            raise ScanFailure(f"laser: no state for {_STALE_S:g} s")
+            raise ScanFailure(f"laser: no state for {_STALE_S:g} s; check that its node runs")
         if self.laser.output != LaserOutput.ON:
             raise ScanFailure(f"laser: went off: {self.laser.reason}")
 

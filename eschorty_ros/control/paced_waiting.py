@@ -12,6 +12,8 @@ from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure
 
 _TICK_S = 0.02
 _NOTED_S = 0.5
+# After a longer stall of this process the others seem to report no longer.
+_STALL_S = 2.5
 # The pace of a reconstruction that gets its events in lumps is known after this time.
 _PACE_KNOWN_S = 5.0
 
@@ -121,9 +123,15 @@ class PacedWaiting:
         """Give feedback, check the reasons to end, sleep for one tick."""
         if self._ended.is_set() or not self._running():
             raise ScanFailure(f"{self._name}: the node was shut down")
-        self._tick_s = time.monotonic()
+        now_s = time.monotonic()
+        stall_s, self._tick_s = now_s - self._tick_s, now_s
         self._feedback(self._phase)
         if self._watching:
+            if stall_s > _STALL_S:
+                raise ScanFailure(
+                    f"{self._name}: its process did not run for {stall_s:.1f} s; look at the "
+                    "computer's load"
+                )
             self.monitor.check_laser()
             self.monitor.check_reconstruction()
             self.monitor.check_progress(self._events_timeout_s)

@@ -116,6 +116,22 @@ def test_the_progress_is_where_the_stage_was_at_the_newest_event():
     assert subject.reconstructed_mm() == 2.0
 
 
+def test_a_stall_of_the_scanner_is_not_taken_for_one_of_the_laser(monkeypatch):
+    subject = monitor()
+    subject.update_laser(LaserReport(1, 70.0, 0.5, ""), 0.0)
+    waiting = PacedWaiting("scanner", subject, lambda: 0, lambda: True, 3.0)
+    waiting.prepare(lambda: False, lambda phase: None)
+    waiting.tick()
+    waiting.watch(True)
+    waiting.tick()
+    stalled_s = time.monotonic() + 6.0
+    monkeypatch.setattr(time, "monotonic", lambda: stalled_s)
+    with pytest.raises(ScanFailure, match=r"scanner: its process did not run for 6\.0 s"):
+        waiting.tick()
+    waiting.watch(False)
+    waiting.tick()
+
+
 @pytest.mark.parametrize(
     ("failure", "words"),
     [
