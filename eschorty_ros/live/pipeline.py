@@ -62,6 +62,7 @@ class ScanReport:
     refusal: str = ""
     profiles_max: int = 0
     clock_step_ns: int = 0
+    periods_empty: int = 0
 
     @property
     def completeness(self) -> float:
@@ -104,12 +105,16 @@ class ScanReport:
         if self.packets_refused:
             notes.append(f"{self.packets_refused} packets were refused, the last: {self.refusal}")
         if self.packets_lost:
-            notes.append(f"{self.packets_lost} packets were lost")
+            notes.append(
+                f"{self.packets_lost} packets were lost; look at the computer's load and at the "
+                "buffers of camera/events"
+            )
         if 0 < self.scan.profiles < COMPLETE * self.profiles_expected:
             notes.append(
                 f"{self.scan.profiles} profiles of {self.profiles_expected} between start and "
                 f"stop; {self.points_outside} points are outside"
             )
+            notes += self._causes_of_few()
         if self._surplus:
             notes.append(
                 f"{self.scan.profiles} profiles of {self._profiles_possible} between start and "
@@ -127,6 +132,20 @@ class ScanReport:
     def _surplus(self) -> bool:
         most = _SURPLUS * self._profiles_possible + _ENDS
         return self.profiles_expected > 0 and self.scan.profiles > most
+
+    def _causes_of_few(self) -> list[str]:
+        """Return what the counts of a scan with few profiles show."""
+        missing = self.profiles_expected - self.scan.profiles
+        found = []
+        if 0 < self.profiles_max < COMPLETE * self.profiles_expected:
+            found.append(f"the stage was there only for as long as {self.profiles_max} take")
+        if 2 * self.periods_empty > missing:
+            found.append(
+                f"{self.periods_empty} periods had no events; check that light falls on the target"
+            )
+        if self.events_dropped:
+            found.append(f"{self.events_dropped} events were dropped; lower the events' rate")
+        return found
 
     def _cause_of_empty(self) -> str:
         if not (self.events and self.points_outside):
@@ -152,6 +171,7 @@ class _Counts(NamedTuple):
     packets_lost: int
     events_dropped: int
     packets_refused: int
+    periods_empty: int
 
 
 class Pipeline:
@@ -191,7 +211,7 @@ class Pipeline:
         self._closed_s = math.inf
         self._clock_step_ns = 0
         self._coverage = SweepCoverage(0.0, 0.0)
-        self._counts_at_begin = _Counts(0, 0, 0, 0, 0)
+        self._counts_at_begin = _Counts(0, 0, 0, 0, 0, 0)
 
     @property
     def scan_id(self) -> str:
@@ -407,4 +427,5 @@ class Pipeline:
             packets_lost=self.stream.packets_lost,
             events_dropped=counters["events_dropped"],
             packets_refused=self.packets_refused,
+            periods_empty=counters["periods_empty"],
         )

@@ -106,6 +106,28 @@ def test_more_profiles_than_the_stages_time_allows_are_named(profiles, possible,
     assert bool(report.message) == surplus
 
 
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ({"profiles_max": 12}, "the stage was there only for as long as 12 take"),
+        ({"periods_empty": 80}, "80 periods had no events; check that light falls"),
+        ({"events_dropped": 7}, "7 events were dropped; lower"),
+        ({"packets_lost": 3}, "3 packets were lost; look at the computer's load"),
+        ({"profiles_max": 100, "periods_empty": 5}, "10 profiles of 100 between start and stop"),
+    ],
+)
+def test_a_scan_with_few_profiles_names_the_cause(counts, words):
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    buffer.add(placed([0.5] * 10, T0_NS + 1_000_000 * np.arange(10), range(10)))
+    names = ("events", "packets", "packets_lost", "events_dropped", "points_without_stage",
+             "points_outside", "points_over_limit", "profiles_expected")  # fmt: skip
+    known = dict(zip(names, (1000, 100, 0, 0, 0, 4, 0, 100), strict=True))
+    message = ScanReport(buffer.assemble(), frequency_hz=70.0, **{**known, **counts}).message
+    assert words in message
+    causes = ("the stage was there", "no events", "were dropped", "were lost")
+    assert [cause for cause in causes if cause in message] == [c for c in causes if c in words]
+
+
 def test_points_of_before_the_scan_are_left_out_and_counted():
     buffer = ScanBuffer("a", 0.0, 1.0, since_ns=T0_NS)
     buffer.add(placed([0.5, 0.5, 0.5], [T0_NS - 1, T0_NS, T0_NS + 1], [1, 2, 3]))
