@@ -16,26 +16,26 @@ SWEEP_MAX_MM = 1000.0
 """Longer than any stage that scans; a recording of it would fill a disk."""
 
 
-class Integer(click.IntRange):
-    """A whole number within bounds, which help and messages give with their ``unit``."""
-
-    name = "integer"
+class _Bounded(click.types._NumberRangeBase):
     unit = ""
-
-    def _describe_range(self) -> str:
-        return f"{super()._describe_range()} {self.unit}".rstrip()
-
-
-class Number(click.FloatRange):
-    """A finite number, within bounds if they are given, with their ``unit``."""
-
-    name = "number"
-    unit = ""
+    """What follows the bounds in help and messages."""
 
     def _describe_range(self) -> str:
         if self.min is None and self.max is None:
             return ""
         return f"{super()._describe_range()} {self.unit}".rstrip()
+
+
+class Integer(_Bounded, click.IntRange):
+    """A whole number within bounds."""
+
+    name = "integer"
+
+
+class Number(_Bounded, click.FloatRange):
+    """A finite number, within bounds if they are given."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number; refuse NaN and infinity."""
