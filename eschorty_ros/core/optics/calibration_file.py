@@ -314,7 +314,7 @@ def refuse_other_sensor(
 
 
 def _may_be_shipped(text: str) -> bool:
-    return re.fullmatch(r"[A-Za-z0-9_-]{1,100}", text) is not None
+    return re.fullmatch(r"[A-Za-z0-9_-]{0,100}", text) is not None
 
 
 def _shipped(name: str) -> Path | None:
@@ -325,7 +325,8 @@ def _shipped(name: str) -> Path | None:
 
 
 def _find(name_or_path: str | os.PathLike[str]) -> Path:
-    text = os.fspath(file_path("name_or_path", name_or_path))
+    file_path("name_or_path", name_or_path)
+    text = os.fsdecode(name_or_path)
     if not _may_be_shipped(text):
         return Path(text)
     if shipped := _shipped(text):

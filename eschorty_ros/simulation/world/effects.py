@@ -57,6 +57,8 @@ class Effects(Schema):
         yaml = "{}" if text == "none" else "{" + text.replace("=", ": ") + "}"
         try:
             document = parse_yaml(yaml.encode(), "effects", ArgumentError)
+            if None in document.data.values():
+                raise ArgumentError("a name has no value")
         except ArgumentError:
             raise ArgumentError(
                 f"effects is {short(text)}; write NAME=VALUE,... with each name once, or none"

@@ -195,7 +195,7 @@ def test_unknown_names_and_paths_are_named(tmp_path):
         (tmp_path / "c.yaml", "'config_9'"),
         (tmp_path / "absent.yaml", r"cannot read .*absent\.yaml"),
         (tmp_path, "cannot read"),
-        ("", "cannot read"),
+        ("", r"''.*nominal, config_1"),
     ):
         with pytest.raises(CalibrationError, match=words):
             load_calibration(name)

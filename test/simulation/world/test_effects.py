@@ -155,6 +155,8 @@ def test_a_slow_readout_delays_the_rows_one_by_one() -> None:
         ("row_time_us=0", "row_time_us"),
         ("ambient=1}", "effects is 'ambient=1}'; write NAME=VALUE,... with each name once"),
         ("ambient=1,ambient=2", "each name once"),
+        ("ambient", "effects is 'ambient'; write NAME=VALUE"),
+        ("falloff_mm=", "effects is 'falloff_mm='; write NAME=VALUE"),
     ],
 )
 def test_effects_that_cannot_be_are_refused(text: str, words: str) -> None:
