@@ -403,7 +403,10 @@ def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
     path = file_path("path", path)
     samples = _read_csv(path, STAGE_DTYPE)
     if len(samples) < 2:
-        raise FormatError(f"{path}: stage samples: {len(samples)}; record two or more")
+        raise FormatError(
+            f"{path}: stage samples: {len(samples)}; record two or more, the same position twice "
+            "where the stage rests"
+        )
     times = samples["t_us"]
     back = np.flatnonzero(np.diff(times) <= 0)
     if back.size:

@@ -185,7 +185,7 @@ def test_faults_survive_the_way_from_another_process():
         (edit("stage.csv", "time,pos\n0,1\n"), ["line 1", "time,pos", "t_us,position_mm"]),
         (edit("stage.csv", "\n"), ["stage.csv line 1", "t_us,position_mm"]),
         (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "samples: 0", "two or more"]),
-        (edit("stage.csv", "t_us,position_mm\n0,1\n"), ["stage.csv", "samples: 1"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n"), ["samples: 1", "twice where"]),
         (edit("stage.csv", "t_us,position_mm\n0,1\n\n5,2\n3,3\n"), ["line 5", "from 5 to 3"]),
         (edit("stage.csv", "t_us,position_mm\n5,2\n5,3\n"), ["line 3", "from 5 to 5"]),
         (edit("stage.csv", "t_us,position_mm\n0,1\n5,abc\n"), ["line 3", "position_mm is 'abc'"]),
