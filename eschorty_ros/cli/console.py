@@ -80,8 +80,10 @@ def table(title: str, *columns: str) -> Table:
     """Return an empty table; the first column is left aligned, the others right."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
-    made = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    shown = Text(title, "table.title", no_wrap=True, overflow="ignore")
+    made = Table(title=shown, box=box.SIMPLE_HEAD, title_justify="left")
     for index, column in enumerate(columns):
         made.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
     return made
@@ -92,7 +94,7 @@ def show(made: Table) -> None:
     from rich.console import Console
 
     free = not sys.stdout.isatty() and "COLUMNS" not in os.environ
-    Console(file=sys.stdout, width=_FILE_COLUMNS if free else None).print(made)
+    Console(file=sys.stdout, width=_FILE_COLUMNS if free else None).print(made, crop=False)
 
 
 def decimals(values: Iterable[float]) -> int:

@@ -23,7 +23,7 @@ from waiting import wait_until
 
 from eschorty_ros import __version__
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, cluster, main
-from eschorty_ros.cli.console import progress_bar, table
+from eschorty_ros.cli.console import pairs, progress_bar, table
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, load_recording, read_cloud, write_cloud
@@ -555,6 +555,12 @@ def test_a_narrow_terminal_cuts_no_number():
     console.print(made)
     text = console.file.getvalue()
     assert ("…" in text, text.count("-1320.017")) == (False, 5)
+
+
+def test_a_path_longer_than_a_table_is_one_line(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "20")
+    pairs("a/recording[bold]/of/long.raw", {"events": "5"})
+    assert "a/recording[bold]/of/long.raw\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nowhere.invalid", "tcp://:x"])
