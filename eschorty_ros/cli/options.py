@@ -14,6 +14,8 @@ from eschorty_ros.simulation.scenes import NAMES
 
 SWEEP_MAX_MM = 1000.0
 """Longer than any stage that scans; a recording of it would fill a disk."""
+SPEED_MAX_MM_S = 1000.0
+"""The fastest sweep of the scanner node."""
 
 
 class _Bounded(click.types._NumberRangeBase):
@@ -64,7 +66,7 @@ _SWEEP = (
     click.option(
         "--speed",
         "speed_mm_s",
-        type=Number(0, min_open=True),
+        type=Number(0, SPEED_MAX_MM_S, min_open=True),
         default=50.0,
         show_default=True,
         help="Stage speed, mm/s.",

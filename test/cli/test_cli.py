@@ -127,6 +127,7 @@ def test_help_imports_nothing_heavy():
         ("scan", "--port", "9000"),
         ("simulate", "--stop", "nan", "--out", "x"),
         ("simulate", "--stop", "100000", "--out", "x"),
+        ("simulate", "--speed", "1e30", "--out", "x"),
         ("convert", __file__, "x", "--packet-period", "9"),
     ],
 )
