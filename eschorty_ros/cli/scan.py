@@ -188,6 +188,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         cloud = result.points if result.organized is None else result.organized
         report_replaced(out / "scan.pcd")
         write_cloud(out / "scan.pcd", cloud)
+        (out / "scan.png").unlink(missing_ok=True)
     if not result.success or not len(result.points):
         kept = f" ({len(result.points):,} points kept in {out / 'scan.pcd'})"
         raise DeviceError(result.message + (kept if len(result.points) else ""))

@@ -176,6 +176,11 @@ def test_what_a_scan_lost_is_printed(tmp_path, capsys):
     assert "is replaced" not in printed
     finish(request, ScanResult(True, lost, points, 4, 100, 0, 0, "complete", 1.0), tmp_path)
     assert "scan.pcd of " in capsys.readouterr().err
+    # A scan that fails has no picture; that of the older scan does not stay.
+    failed = ScanResult(False, "the stage stalled", points, 4, 100, 0, 0, "failed", 0.5)
+    with pytest.raises(DeviceError, match=r"the stage stalled \(4 points kept in"):
+        finish(request, failed, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["scan.pcd"]
 
 
 def test_a_recording_without_room_for_its_truth_is_a_warning_below_the_scan(tmp_path, capsys):
