@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from eschorty_ros.core.base.errors import CalibrationError, FitError
+from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.calibration.moving_target import moving_target
 from eschorty_ros.core.calibration.post_finder import find_posts
 from eschorty_ros.core.calibration.post_matching import KnownTarget, PostMatch, match_posts
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.evt3 import Decoder
-from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.optics import Calibration, refuse_other_sensor
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import Recording
 from eschorty_ros.core.storage.raw_file import RawReader
@@ -36,7 +36,8 @@ def recorded_posts(
     is found, or the posts agree with the ranges in more than one way. Raises ``FormatError`` when
     the event file is not EVT3.
     """
-    _check_sensor(recording, nominal)
+    made = recording.calibration
+    refuse_other_sensor(str(recording.path), made.columns, made.rows, nominal)
     frame = AggregateFrame(nominal.columns, nominal.rows)
     decoder = Decoder(nominal.columns, nominal.rows)
     total, done = recording.events_path.stat().st_size, 0
@@ -70,7 +71,8 @@ def recorded_moving_target(
     - ``range_at_zero_mm``, ``range_per_stage``, ``sigma_at_zero_mm``, ``blocks``: As in
       `moving_target`, which also lists the errors.
     """
-    _check_sensor(recording, nominal)
+    made = recording.calibration
+    refuse_other_sensor(str(recording.path), made.columns, made.rows, nominal)
     profiles = reconstruct_recording(recording, progress=progress).profiles
     return moving_target(
         profiles,
@@ -80,13 +82,3 @@ def recorded_moving_target(
         sigma_at_zero_mm=sigma_at_zero_mm,
         blocks=blocks,
     )
-
-
-def _check_sensor(recording: Recording, nominal: Calibration) -> None:
-    made = recording.calibration
-    if (made.columns, made.rows) != (nominal.columns, nominal.rows):
-        raise CalibrationError(
-            f"{recording.path} has a sensor of {made.columns} x {made.rows} and the nominal build "
-            f"{nominal.name} one of {nominal.columns} x {nominal.rows}; choose a nominal build "
-            "with the recording's sensor"
-        )
