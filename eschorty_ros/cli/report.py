@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.base.files import make_folder
 
 if TYPE_CHECKING:
     from eschorty_ros.report.sections import Section
@@ -74,12 +75,7 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
     names = [name for name in NAMES if name in only] if only else list(NAMES)
     effort = Effort(fast=fast, seed=seed)
     made_with = provenance(effort)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArgumentError(
-            f"--out is {out}: {error.strerror}; choose a path where a folder can be made"
-        ) from error
+    make_folder(out)
     page = write_page(out, [], made_with, len(names))
     sections: list[Section] = []
     with progress_bar("report") as progress:

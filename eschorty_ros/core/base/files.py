@@ -107,6 +107,17 @@ def atomic_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
             (made / name).replace(folder / name)
 
 
+def make_folder(path: str | os.PathLike[str]) -> Path:
+    """Make a folder, and those it is in, unless it is there; return its path.
+
+    Raises ``ArgumentError`` when it cannot be made; names the path and the reason.
+    """
+    folder = file_path("path", path)
+    with _named(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check before long work that ``atomic_write`` can write ``path``; leaves nothing behind.
 

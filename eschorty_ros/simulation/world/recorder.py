@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.files import atomic_files
+from eschorty_ros.core.base.files import atomic_files, make_folder
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.clocks import MotionPlan, plan_move
 from eschorty_ros.core.modulation import Modulation
@@ -86,7 +85,7 @@ def simulate_recording(
     # The plan rests at its first position before it starts.
     world.set_stage(MotionPlan(0, start_mm))
     world.set_stage(move, 0)
-    folder = _folder(out_dir)
+    folder = make_folder(out_dir)
     with _complete_or_absent(folder) as made:
         with RawWriter(made / EVENTS_FILE, width=world.columns, height=world.rows) as raw:
             while world.now_us < end_us:
@@ -116,14 +115,3 @@ def _complete_or_absent(folder: Path) -> Iterator[Path]:
         with suppress(OSError):
             folder.rmdir()
         raise
-
-
-def _folder(out_dir: str | os.PathLike[str]) -> Path:
-    folder = Path(out_dir)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ArgumentError(
-            f"cannot make the folder {str(folder)!r} ({error.strerror}); choose another"
-        ) from error
-    return folder
