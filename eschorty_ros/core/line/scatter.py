@@ -87,9 +87,11 @@ def _clear_scatter(scatter):
 
 
 @kernel(inline="always")
-def _add(value, block, sums):
-    """Add a profile's sum over a block to the share kept of those before."""
-    sums[block] = _KEPT * sums[block] + value
+def _add(squares, expected, number, block, sums):
+    """Add a profile's sums over a block to the share kept of those before."""
+    sums.squares[block] = _KEPT * sums.squares[block] + squares
+    sums.expected[block] = _KEPT * sums.expected[block] + expected
+    sums.number[block] = _KEPT * sums.number[block] + number
 
 
 @kernel(_nrt=False)
@@ -130,9 +132,7 @@ def _add_differences(row, sigma2, sums):
                 squares += square
                 expected += expected2
                 number += 1.0
-        _add(squares, block, sums.squares)
-        _add(expected, block, sums.expected)
-        _add(number, block, sums.number)
+        _add(squares, expected, number, block, sums)
 
 
 @kernel(inline="always")
@@ -174,9 +174,7 @@ def _add_smoothed_differences(row, sigma2, averaged, own2, apart_min, sums):
                 squares += square
                 expected += expected2
                 number += 1.0
-        _add(squares, block, sums.squares)
-        _add(expected, block, sums.expected)
-        _add(number, block, sums.number)
+        _add(squares, expected, number, block, sums)
 
 
 @kernel
