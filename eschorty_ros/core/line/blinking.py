@@ -87,7 +87,7 @@ class _LaserTest(NamedTuple):
     sure: bool
 
 
-def blink(modulation: Modulation, every: int) -> Blink:
+def make_blink(modulation: Modulation, every: int) -> Blink:
     """Return the test for profiles of ``every`` periods; none where a period is too short."""
     no_lines = np.zeros(4)
     if modulation.period_us < PERIOD_MIN_US:

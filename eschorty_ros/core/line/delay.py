@@ -34,7 +34,7 @@ class Light(NamedTuple):
     delay_max_us: float = -1.0
 
 
-def light(modulation: Modulation, every: int) -> Light:
+def make_light(modulation: Modulation, every: int) -> Light:
     """Return the light of profiles of ``every`` periods."""
     period_us = modulation.period_us
     return Light(

@@ -9,7 +9,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.estimators import HALF_MIN, HALF_PER_SIGMA
 from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
-PROFILES = 3
+PROFILES_WITH_TWO = 3
 """Successive profiles that show two lines."""
 _COLUMNS = 64
 # Rows of fewer events are apart by chance too often, and so are those of fewer lines.
@@ -23,7 +23,7 @@ _SIDES = 3.0 / 19.0
 _PIXEL2 = 1.0 / 12.0
 
 
-def empty_successive() -> NDArray[np.int64]:
+def empty_two_lines() -> NDArray[np.int64]:
     """Return zeroed counts of profiles, one per column that is tested."""
     return np.zeros(_COLUMNS, np.int64)
 
@@ -102,7 +102,7 @@ def _single_half(columns, half, successive, profiles):
         lines += whole > 0.0
         has_two = whole > _VARIANCE_MIN and sides < _SIDES * whole
         successive[k] = successive[k] + 1 if has_two else 0
-        if successive[k] >= PROFILES:
+        if successive[k] >= PROFILES_WITH_TWO:
             two += 1
             total += sides
     if 2 * two <= lines or two < _LINES_MIN:

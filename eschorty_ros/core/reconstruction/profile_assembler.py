@@ -14,7 +14,7 @@ from eschorty_ros.core.base.pointer import Pointer
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
-from eschorty_ros.core.line.blinking import blink
+from eschorty_ros.core.line.blinking import make_blink
 from eschorty_ros.core.line.columns import (
     _append,
     _bin,
@@ -24,7 +24,7 @@ from eschorty_ros.core.line.columns import (
     _needs_room,
     wider_columns,
 )
-from eschorty_ros.core.line.delay import Light, light
+from eschorty_ros.core.line.delay import Light, make_light
 from eschorty_ros.core.line.estimators import FULL_COLUMN_METHODS
 from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
@@ -114,14 +114,14 @@ class ProfileAssembler:
         gate_us = self._gate_us
         if gate_us == GATE_LEARNED and first is not None:
             gate_us = background_gate_us(first, edge_us, modulation, self._window_rows)
-        lit = light(modulation, every)
+        lit = make_light(modulation, every)
         if self._takes_background:
             # It comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
         self._use(
             self._memory._replace(
                 gate=make_gate(modulation, gate_us),
-                blink=blink(modulation, every),
+                blink=make_blink(modulation, every),
                 light=lit,
             )
         )

@@ -71,7 +71,7 @@ from eschorty_ros.core.line.scatter import (
 )
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth, empty_smoothing
-from eschorty_ros.core.line.two_lines import PROFILES, _single_half, empty_successive
+from eschorty_ros.core.line.two_lines import PROFILES_WITH_TWO, _single_half, empty_two_lines
 from eschorty_ros.core.line.unusual import (
     UsualWidths,
     Widths,
@@ -236,7 +236,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
             shape,
         ),
         widths=empty_widths(shape),
-        two_lines=empty_successive(),
+        two_lines=empty_two_lines(),
         history=empty_history(model.columns, windowed),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
@@ -479,7 +479,7 @@ def _close(memory):
     _count(sums, counters)
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     single = np.int64(0)
-    if _is_examined(memory, PROFILES):
+    if _is_examined(memory, PROFILES_WITH_TWO):
         profiles = state.profiles if state.known_half == 0 else -1
         single = _single_half(memory.columns, half, memory.two_lines, profiles)
     if _is_examined(memory, 1):
