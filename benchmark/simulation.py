@@ -41,9 +41,7 @@ CASES = [
 
 def run(scene: str, lit: int, frequency_hz: float, seconds: float) -> tuple[float, int, int]:
     """Return thread seconds, events and bytes; with ``lit`` 0 all columns without laser."""
-    calibration = replace(
-        load_calibration("config_3"), columns=lit or 1280, principal_column=(lit or 1280) / 2 - 0.5
-    )
+    calibration = replace(load_calibration("config_3"), columns=lit or 1280, principal_column=None)
     world = World(named(scene), calibration, seed=1, background_hz=BACKGROUND_HZ)
     if lit:
         world.set_laser(0, True, Modulation(frequency_hz, 0.5, "square", 0))

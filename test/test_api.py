@@ -11,7 +11,7 @@ from eschorty_ros.simulation.world import simulate_recording
 
 
 def test_settings_are_checked_and_an_empty_cloud_is_not_saved(tmp_path):
-    narrow = replace(es.load_calibration("config_3"), columns=96, principal_column=47.5)
+    narrow = replace(es.load_calibration("config_3"), columns=96, principal_column=None)
     simulate_recording(tmp_path, Plane(1300.0), narrow, stop_mm=12.0)
     with pytest.raises(es.EschortyError, match="no setting 'centre'"):
         es.reconstruct(tmp_path, centre="mean")

@@ -148,9 +148,7 @@ def record_streams(
 ) -> list[Stream]:
     """Record every scene with every background, on the columns in the middle of the line."""
     streams = []
-    calibration = replace(
-        load_calibration("config_3"), columns=columns, principal_column=0.5 * (columns - 1)
-    )
+    calibration = replace(load_calibration("config_3"), columns=columns, principal_column=None)
     for name in SCENES:
         scene = named(name)
         note(f"simulating {name}")

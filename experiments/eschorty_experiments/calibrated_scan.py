@@ -155,7 +155,7 @@ def _moved(effort: Effort, design: Calibration, built: Calibration) -> Targets:
 
 def _narrow(build: Calibration) -> Calibration:
     """Return the build with the few columns that suffice for a flat target."""
-    return replace(build, columns=MOVED_COLUMNS, principal_column=0.5 * (MOVED_COLUMNS - 1))
+    return replace(build, columns=MOVED_COLUMNS, principal_column=None)
 
 
 def _findings(

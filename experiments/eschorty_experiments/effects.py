@@ -114,9 +114,7 @@ def _scan(
     scene: Scene, text: str, effort: Effort, start_mm: float = START_MM, travel_mm: float = 0.0
 ) -> Scanned:
     columns = effort.choose(640, 96)
-    build = replace(
-        load_calibration("config_3"), columns=columns, principal_column=0.5 * (columns - 1)
-    )
+    build = replace(load_calibration("config_3"), columns=columns, principal_column=None)
     effects = Effects.parse(text)
     with TemporaryDirectory(prefix="eschorty_") as folder:
         recording = simulate_recording(

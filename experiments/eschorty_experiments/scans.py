@@ -61,8 +61,7 @@ class Case:
     @property
     def calibration(self) -> Calibration:
         """Calibration of the build, with the columns in the middle."""
-        middle = 0.5 * (self.columns - 1)
-        return replace(load_calibration(self.build), columns=self.columns, principal_column=middle)
+        return replace(load_calibration(self.build), columns=self.columns, principal_column=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

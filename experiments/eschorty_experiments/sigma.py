@@ -147,9 +147,7 @@ def _ratios(
     scene = SCENES[scene_name]
     # Thousands of periods have points enough with fewer columns.
     columns = effort.choose(640, 160) if frequency_hz <= SATURATED_HZ else effort.choose(80, 40)
-    calibration = replace(
-        load_calibration("config_3"), columns=columns, principal_column=(columns - 1) / 2
-    )
+    calibration = replace(load_calibration("config_3"), columns=columns, principal_column=None)
     found = []
     with TemporaryDirectory() as folder:
         recording = simulate_recording(

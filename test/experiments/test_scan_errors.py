@@ -19,9 +19,7 @@ MODEL = load_calibration("config_3").model()
 
 
 def narrow(columns=64):
-    return replace(
-        load_calibration("config_3"), columns=columns, principal_column=columns / 2 - 0.5
-    )
+    return replace(load_calibration("config_3"), columns=columns, principal_column=None)
 
 
 def test_errors_gross_errors_and_gaps_are_told_apart(tmp_path):

@@ -219,7 +219,7 @@ def test_a_single_profile_has_no_period():
 
 @pytest.mark.parametrize("scene", ["steps", "tilted", "leaves"])
 def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
-    narrow = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+    narrow = replace(load_calibration("config_3"), columns=96, principal_column=None)
     recording = simulate_recording(tmp_path, named(scene), narrow, stop_mm=40.0, seed=8)
     found = reconstruct_recording(recording)
     scored = accuracy.measure_recorded(found.points, found.profiles, recording)
@@ -251,7 +251,7 @@ def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
 def test_points_in_a_file_are_those_in_memory(tmp_path, monkeypatch):
     """Also where a profile ends in a later piece of the file."""
     monkeypatch.setattr(offline, "_PASS_BYTES", mmap.PAGESIZE)
-    narrow = replace(load_calibration("config_3"), columns=24, principal_column=11.5)
+    narrow = replace(load_calibration("config_3"), columns=24, principal_column=None)
     recording = simulate_recording(tmp_path, named("steps"), narrow, stop_mm=14.0, seed=8)
     for name in ("with_truth", "without"):
         (tmp_path / name).mkdir()

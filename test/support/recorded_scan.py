@@ -34,7 +34,7 @@ LIMITS_MM = 11.0, 19.0
 
 def source(folder):
     """Simulate what camera and stage send: 64 columns, 10 mm at 50 mm/s."""
-    small = replace(load_calibration("config_3"), columns=64, principal_column=31.5)
+    small = replace(load_calibration("config_3"), columns=64, principal_column=None)
     return simulate_recording(
         folder, named("tilted"), small, start_mm=10.0, stop_mm=20.0, seed=SEED
     )

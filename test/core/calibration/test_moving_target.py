@@ -12,7 +12,7 @@ from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
-NOMINAL = replace(load_calibration("config_3"), columns=48, principal_column=23.5)
+NOMINAL = replace(load_calibration("config_3"), columns=48, principal_column=None)
 CHANGED = {"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": -1102.74}
 AS_BUILT = replace(NOMINAL, **CHANGED)
 SPEED_MM_S = 100.0

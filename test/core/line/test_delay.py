@@ -13,7 +13,7 @@ from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
-NARROW = replace(CALIBRATION, columns=128, principal_column=63.5)
+NARROW = replace(CALIBRATION, columns=128, principal_column=None)
 MODEL = NARROW.model()
 
 

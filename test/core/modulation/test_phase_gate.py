@@ -157,7 +157,7 @@ class HalfDark(Plane):
 
 
 def recorded(folder, scene, columns=320, speed_mm_s=50.0, travel_mm=(10.0, 30.0), pixels="paper"):
-    narrow = replace(CALIBRATION, columns=columns, principal_column=(columns - 1) / 2)
+    narrow = replace(CALIBRATION, columns=columns, principal_column=None)
     return simulate_recording(
         folder, scene, narrow, Modulation(70.0), *travel_mm, speed_mm_s, SEED,
         parameters=preset(pixels),
@@ -250,7 +250,7 @@ def test_a_learned_gate_does_not_move_a_line_that_moves_while_it_is_lit(tmp_path
 def test_a_learned_gate_does_not_lag(
     tmp_path, scene, columns, pixels, speed_mm_s, travel_mm, most_mm
 ):
-    calibration = replace(CALIBRATION, columns=columns, principal_column=(columns - 1) / 2)
+    calibration = replace(CALIBRATION, columns=columns, principal_column=None)
     recording = simulate_recording(
         tmp_path, scene, calibration, Modulation(70.0), *travel_mm, speed_mm_s, 0,
         parameters=preset(pixels),
@@ -264,7 +264,7 @@ def test_a_learned_gate_does_not_lag(
 def on_steps(folder, pixels):
     """A sweep over steps, and the range errors without a gate and with one to be learned."""
     scene = named("steps")
-    calibration = replace(CALIBRATION, columns=1280, principal_column=639.5)
+    calibration = load_calibration("config_3")
     recording = simulate_recording(
         folder, scene, calibration, Modulation(70.0), 10.0, 70.0, 50.0, 0,
         parameters=preset(pixels),

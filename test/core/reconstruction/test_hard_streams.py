@@ -249,7 +249,7 @@ def test_few_events_are_no_flag_where_all_points_have_few(frequency_hz):
 
 @pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
 def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
-    narrow = replace(CALIBRATION, columns=160, principal_column=79.5)
+    narrow = replace(CALIBRATION, columns=160, principal_column=None)
     sweep = (10.0, 16.0, 300.0)
     recording = simulate_recording(tmp_path, Plane(), narrow, Modulation(frequency_hz), *sweep, 1)
     found = reconstruct_recording(recording).profiles
@@ -262,7 +262,7 @@ def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequenc
 @pytest.fixture(scope="module")
 def swept_face(tmp_path_factory):
     """Points of a face that is swept fast, with these settings, and their errors in mm."""
-    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    narrow = replace(CALIBRATION, columns=320, principal_column=None)
     scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
     folder = tmp_path_factory.mktemp("face")
     recording = simulate_recording(folder, scene, narrow, Modulation(70.0), *sweep)
@@ -476,7 +476,7 @@ def test_rows_that_scatter_more_are_averaged_and_have_an_honest_sigma(share, err
 
 def test_sigma_covers_what_pixels_without_noise_hide(tmp_path):
     """All of them fire in the same rows, up to half a row off."""
-    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    narrow = replace(CALIBRATION, columns=320, principal_column=None)
     scene, sweep = Plane(slope_column=0.1), (10.0, 25.0, 50.0)
     ideal = {"seed": 3, "parameters": preset("ideal")}
     recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep, **ideal)
@@ -684,7 +684,7 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
 
 
 def test_a_line_that_moves_at_1_khz_is_no_fault_of_the_readout(tmp_path):
-    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    narrow = replace(CALIBRATION, columns=320, principal_column=None)
     scene, sweep = named("face", narrow.model()), (40.0, 44.0, 100.0)
     recording = simulate_recording(tmp_path, scene, narrow, Modulation(1000.0), *sweep, 1)
     assert reconstruct_recording(recording).warnings == (), "seed 1"

@@ -618,7 +618,7 @@ def test_settings_describe_themselves_and_refuse_bad_values():
 
 
 def test_a_computer_with_more_cores_than_threads_may_be_reconstructs(tmp_path, monkeypatch):
-    narrow = replace(CALIBRATION, columns=16, principal_column=7.5)
+    narrow = replace(CALIBRATION, columns=16, principal_column=None)
     scene, modulation = Plane(1320.0), Modulation(70.0)
     recording = simulate_recording(tmp_path, scene, narrow, modulation, 10.0, 12.0, 20.0, SEED)
     one = reconstruct_recording(recording, jobs=1)

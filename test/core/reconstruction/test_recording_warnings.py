@@ -20,7 +20,7 @@ from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
-NARROW = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+NARROW = replace(load_calibration("config_3"), columns=96, principal_column=None)
 
 
 @pytest.fixture(scope="module")
@@ -109,14 +109,14 @@ def test_a_light_of_the_other_polarity_has_its_reason_alone(tmp_path):
 
 def test_lines_that_the_limits_of_the_range_cut_are_no_fault_of_the_camera(tmp_path):
     """The region of interest ends a line's width behind the limit."""
-    build = replace(NARROW, columns=480, principal_column=239.5)
+    build = replace(NARROW, columns=480)
     recording = simulate_recording(tmp_path, named("steps"), build, stop_mm=30.0)
     result = reconstruct_recording(recording, Settings(range_max=1.3))
     assert (result.warnings, len(result.points) > 0) == ((), True)
 
 
 def test_limits_of_the_range_without_a_point_are_the_reason(tmp_path):
-    build = replace(NARROW, columns=480, principal_column=239.5)
+    build = replace(NARROW, columns=480)
     recording = simulate_recording(
         tmp_path, named("steps"), build, stop_mm=30.0, parameters=preset("noisy")
     )
@@ -127,7 +127,7 @@ def test_limits_of_the_range_without_a_point_are_the_reason(tmp_path):
 
 
 def test_the_share_of_cut_points_is_the_same_where_only_good_ones_are_kept(tmp_path):
-    build = replace(NARROW, columns=480, principal_column=239.5)
+    build = replace(NARROW, columns=480)
     near = Plane(build.model().range_limits_mm[0] + 8.0, slope_column=0.9)
     recording = simulate_recording(tmp_path, near, build, stop_mm=16.0, seed=1)
     found = {keep: reconstruct_recording(recording, Settings(keep=keep)) for keep in KEEP}
@@ -138,7 +138,7 @@ def test_the_share_of_cut_points_is_the_same_where_only_good_ones_are_kept(tmp_p
 
 @pytest.mark.parametrize("start_mm", [51.2, 51.8])
 def test_a_step_that_passes_at_first_is_no_fault_of_the_camera(tmp_path, start_mm):
-    build = replace(NARROW, columns=480, principal_column=239.5)
+    build = replace(NARROW, columns=480)
     sweep = {"start_mm": start_mm, "stop_mm": 75.0, "seed": 0}
     result = reconstruct_recording(simulate_recording(tmp_path, named("steps"), build, **sweep))
     assert result.warnings == (), "seed 0"

@@ -16,7 +16,7 @@ from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import SensorControl, World
 
 SEED = 4
-SMALL = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+SMALL = replace(load_calibration("config_3"), columns=96, principal_column=None)
 
 
 def keys(t, y, x, p=1) -> np.ndarray:

@@ -12,7 +12,7 @@ from eschorty_ros.simulation.world import simulate_recording
 BENT = replace(
     load_calibration("config_3"),
     columns=96,
-    principal_column=47.5,
+    principal_column=None,
     b_prime_1_px=-9.0,
     b_prime_2_px=5.0,
 )

@@ -16,7 +16,7 @@ from eschorty_ros.simulation.scenes import Plane, Steps
 from eschorty_ros.simulation.world import Effects, World
 
 SEED = 4
-BUILD = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+BUILD = replace(load_calibration("config_3"), columns=96, principal_column=None)
 MODEL = BUILD.model()
 QUIET = replace(preset("paper"), noise=0.0, threshold_mismatch=0.0)
 RANGE_MM = 1320.0

@@ -13,7 +13,7 @@ from eschorty_ros.simulation.scenes import Plane, Sphere, named
 from eschorty_ros.simulation.world import World, line_on_scene
 
 SEED = 2
-CALIBRATION = replace(load_calibration("config_3"), columns=48, principal_column=23.5)
+CALIBRATION = replace(load_calibration("config_3"), columns=48, principal_column=None)
 MODEL = CALIBRATION.model()
 HALF_ROWS = 12.0
 

@@ -18,7 +18,7 @@ from eschorty_ros.simulation.world import SensorControl, World
 
 SEED = 12
 QUIET = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
-SMALL = replace(load_calibration("config_3"), columns=64, principal_column=31.5)
+SMALL = replace(load_calibration("config_3"), columns=64, principal_column=None)
 
 
 def world(frequency_hz: float = 500.0, preset_name: str = "paper") -> World:

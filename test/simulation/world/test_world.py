@@ -29,7 +29,7 @@ from eschorty_ros.simulation.world import world as world_module
 
 SEED = 11
 FULL = load_calibration("config_3")
-SMALL = replace(FULL, columns=96, principal_column=47.5)
+SMALL = replace(FULL, columns=96, principal_column=None)
 WAVE = Modulation(70.0, 0.5, "square", 1000)
 
 
