@@ -61,11 +61,11 @@ class Score:
     condition: float
 
 
-TWO_SIZES = np.where(np.arange(9) % 2, ONE_INCH, TWO_INCH)
+TWO_SIZES_MM = np.where(np.arange(9) % 2, ONE_INCH, TWO_INCH)
 CASES = (
     Case("9 posts, one size", NINE_MM, {"size_mm": ONE_INCH}),
     Case("9 posts, one size, bloomed", NINE_MM, {"size_mm": ONE_INCH, "bloom_px": BLOOM_PX}),
-    Case("9 posts, two sizes, bloomed", NINE_MM, {"size_mm": TWO_SIZES, "bloom_px": BLOOM_PX}),
+    Case("9 posts, two sizes, bloomed", NINE_MM, {"size_mm": TWO_SIZES_MM, "bloom_px": BLOOM_PX}),
     Case("9 posts, spacings of 100 mm", NINE_MM, {"spacing_mm": 100.0}),
     Case("4 posts, one size", FOUR_MM, {"size_mm": ONE_INCH}),
     Case("6 posts in 1150-1300 mm", SIX_MM, {"size_mm": ONE_INCH}),
@@ -146,7 +146,7 @@ def coverage(design: RangeModel, rng: np.random.Generator) -> dict[str, float]:
         drawn = {name: rng.normal(getattr(design, name), priors[name]) for name in PARAMETERS}
         truth = replace(design, **drawn)
         bloom = rng.normal(0.0, priors[WIDTH_BIAS])
-        targets = measured_posts(truth, NINE_MM, rng, size_mm=TWO_SIZES, bloom_px=bloom)
+        targets = measured_posts(truth, NINE_MM, rng, size_mm=TWO_SIZES_MM, bloom_px=bloom)
         targets = targets.select((targets.row > 0.0) & (targets.row < design.rows - 1.0))
         found = fit(targets, design, JOINT.free, prior_sigma=priors)
         sigma = np.sqrt(np.diag(found.covariance))[: len(PARAMETERS)]

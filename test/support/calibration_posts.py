@@ -4,6 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from eschorty_experiments._calibration_runs import CHECK_MM, NINE_MM
+from eschorty_experiments._calibration_runs import TWO_SIZES_MM as TWO_SIZES_MM
 from eschorty_experiments._measured_posts import measured_posts
 
 from eschorty_ros.core.calibration import Targets
@@ -12,9 +14,6 @@ from eschorty_ros.core.optics import RangeModel, load_calibration
 NOMINAL = load_calibration("config_3")
 DESIGN = NOMINAL.model()
 TRUTH = replace(DESIGN, k_mm=24.20, k_prime_px=-37100.0, b_mm=1.5, b_prime_px=-1140.0)
-NINE_MM = np.linspace(820.0, 2050.0, 9)
-TWO_SIZES_MM = np.where(np.arange(9) % 2, 25.4, 50.8)
-CHECK_MM = np.array([800.0, 1000.0, 1320.0, 1700.0, 2100.0])
 COLUMN = 1200.0
 
 
