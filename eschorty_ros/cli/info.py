@@ -11,6 +11,7 @@ import click
 
 from eschorty_ros.cli.console import pairs, progress_bar, warn
 from eschorty_ros.cli.files import is_yaml
+from eschorty_ros.core.base.errors import FormatError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -92,8 +93,12 @@ def command(path: Path) -> None:
         pairs(str(path), _truth(read_truth_csv(path)))
     elif path.suffix.lower() == ".csv":
         pairs(str(path), _stage(read_stage_csv(path)))
-    else:
+    elif path.suffix.lower() == ".raw":
         _raw(path)
+    else:
+        raise FormatError(
+            f"{path} ends in {path.suffix!r}; give a recording, a file of it, a bag or a cloud"
+        )
 
 
 def _in_short(calibration: Calibration) -> str:

@@ -332,6 +332,12 @@ def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     assert "peak rate" in good("info", recording / "events.raw")
 
 
+def test_info_names_what_it_shows_where_a_file_is_something_else(tmp_path):
+    (tmp_path / "page.html").write_text("<html>")
+    result = run("info", tmp_path / "page.html")
+    assert_fails_in_one_line(result, "ends in '.html'; give a recording, a file of it, a bag or")
+
+
 def test_info_counts_the_rising_edges_of_the_trigger_input(tmp_path):
     file = tmp_path / "events.raw"
     words = words_of("8000 6064 002A A001 A000 A001")
