@@ -127,20 +127,27 @@ class PacedWaiting:
         stall_s, self._tick_s = now_s - self._tick_s, now_s
         self._feedback(self._phase)
         if self._watching:
-            if stall_s > _STALL_S:
-                raise ScanFailure(
-                    f"{self._name}: its process did not run for {stall_s:.1f} s; look at the "
-                    "computer's load"
-                )
-            self.monitor.check_laser()
-            self.monitor.check_reconstruction()
-            self.monitor.check_progress(self._events_timeout_s)
+            self._check_light(stall_s)
         if not self._shielded:
             # One that has failed gives no light until it is configured again.
             self.monitor.check_laser_works()
             if self._canceled():
                 raise ScanCanceled
         time.sleep(_TICK_S)
+
+    def _check_light(self, stall_s: float) -> None:
+        """Raise ``ScanFailure`` without light or events; this process ran ``stall_s`` ago."""
+        try:
+            self.monitor.check_laser()
+            self.monitor.check_reconstruction()
+            self.monitor.check_progress(self._events_timeout_s)
+        except ScanFailure:
+            if stall_s > _STALL_S:
+                raise ScanFailure(
+                    f"{self._name}: its process did not run for {stall_s:.1f} s; look at the "
+                    "computer's load"
+                ) from None
+            raise
 
     def wait(
         self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
