@@ -10,12 +10,11 @@ that the lines of a stream have in common.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.window import (
     BLOCK,
@@ -62,11 +61,10 @@ class Blink(NamedTuple):
     """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
 
     A ``step`` of 0 is no test. ``lit_us`` is the time from rising to falling edge, 0 where a
-    profile has more periods than one. ``lines`` has the sums of the unit vectors of recent lines,
-    x and y, and the numbers of those that had lines before them and of those near these.
+    profile has more periods than one. ``lines`` are `recent_lines`.
     """
 
-    lines: NDArray[np.float64]
+    lines: Any
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
     lit_us: np.uint32 = np.uint32(0)
@@ -87,14 +85,21 @@ class _LaserTest(NamedTuple):
     sure: bool
 
 
+def recent_lines() -> Any:
+    """Return the sums over recent lines, zeros: ``x`` and ``y`` are those of their unit vectors.
+
+    The ``number`` is of those that had lines before them, and ``near`` of those near these.
+    """
+    return record("x", "y", "number", "near", value=0.0)
+
+
 def make_blink(modulation: Modulation, every: int) -> Blink:
     """Return the test for profiles of ``every`` periods; none where a period is too short."""
-    no_lines = np.zeros(4)
     if modulation.period_us < PERIOD_MIN_US:
-        return Blink(no_lines)
+        return Blink(recent_lines())
     turn = 1 << 32
     return Blink(
-        no_lines,
+        recent_lines(),
         np.uint32(round(turn / modulation.period_us)),
         np.uint32(round(turn * modulation.duty)),
         np.uint32(round(modulation.duty * modulation.period_us) if every == 1 else 0),
@@ -156,7 +161,7 @@ def _is_in_phase(sums, blink):
 @kernel(_nrt=False)
 def _cosine(vector, blink):
     """Return the cosine between a phase and that of recent lines; 0 if there are none."""
-    x, y = blink.lines[0], blink.lines[1]
+    x, y = blink.lines.x, blink.lines.y
     lengths2 = (x * x + y * y) * float(vector.x * vector.x + vector.y * vector.y)
     return (vector.x * x + vector.y * y) / np.sqrt(lengths2) if lengths2 > 0.0 else 0.0
 
@@ -164,8 +169,9 @@ def _cosine(vector, blink):
 @kernel(_nrt=False)
 def _is_alike(vector, blink):
     """Return whether a phase is near that which the stream's lines have in common, if any."""
-    number, near = blink.lines[2], blink.lines[3]
-    return number < _LINES_MIN or 2.0 * near < number or _cosine(vector, blink) > _ALIKE
+    lines = blink.lines
+    no_phase = lines.number < _LINES_MIN or 2.0 * lines.near < lines.number
+    return no_phase or _cosine(vector, blink) > _ALIKE
 
 
 @kernel(_nrt=False)
@@ -174,6 +180,12 @@ def _is_of_the_stream(column, window, blink):
     if not _is_in_phase(window.sums, blink):
         return False
     return _is_alike(_vector(column, window.first, window.last, blink), blink)
+
+
+@kernel
+def _clear_lines(lines):
+    """Clear the sums over recent lines."""
+    lines.x = lines.y = lines.number = lines.near = 0.0
 
 
 @kernel(_nrt=False)
@@ -194,12 +206,11 @@ def _add_lines(columns, half, place, blink):
         if length > 0.0:
             x += vector.x / length
             y += vector.y / length
-            number += blink.lines[0] != 0.0
+            number += blink.lines.x != 0.0
             near += _cosine(vector, blink) > _NEAR
-    blink.lines[0] = _KEPT * blink.lines[0] + x
-    blink.lines[1] = _KEPT * blink.lines[1] + y
-    blink.lines[2] = _KEPT * blink.lines[2] + number
-    blink.lines[3] = _KEPT * blink.lines[3] + near
+    lines = blink.lines
+    lines.x, lines.y = _KEPT * lines.x + x, _KEPT * lines.y + y
+    lines.number, lines.near = _KEPT * lines.number + number, _KEPT * lines.near + near
 
 
 @kernel(_nrt=True)

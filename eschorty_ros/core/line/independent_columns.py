@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, integer_vector, number
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line.blinking import Blink
+from eschorty_ros.core.line.blinking import Blink, recent_lines
 from eschorty_ros.core.line.centroid import _estimate_columns, empty_rows, make_row_counts
 from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import Estimator, check_method, half_width_fixed
@@ -110,7 +110,7 @@ def estimate(
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()
-    footprint, blink = make_footprint(estimator.half_max, columns=0), Blink(lines=np.zeros(4))
+    footprint, blink = make_footprint(estimator.half_max, columns=0), Blink(lines=recent_lines())
     _estimate_columns(columns, estimator.half_max, estimator, blink, footprint, found, row_counts)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.blinking import Blink, _add_lines
+from eschorty_ros.core.line.blinking import Blink, _add_lines, _clear_lines, recent_lines
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS
 from eschorty_ros.core.line.burst_shift import (
     Bursts,
@@ -222,7 +222,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
     return Memory(
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
         estimator=estimator,
-        blink=Blink(lines=np.zeros(4)),
+        blink=Blink(lines=recent_lines()),
         bursts=empty_bursts(model.columns),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
@@ -267,7 +267,7 @@ def _begin_window(memory):
     memory.two_lines[:] = 0
     _clear_scatter(memory.scatter)
     _clear_bursts(memory.bursts)
-    memory.blink.lines[:] = 0.0
+    _clear_lines(memory.blink.lines)
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
     _restart_gate(memory.gate)
@@ -416,7 +416,7 @@ def _follow(memory, half, restarted):
     state, columns, blink = memory.state, memory.columns, memory.blink
     history, place = memory.history, state.profiles % BLOCK_COLUMNS
     if restarted:
-        blink.lines[:] = 0.0
+        _clear_lines(blink.lines)
     _add_lines(columns, half, place, blink)
     _compare_polarities(columns, half, place, history)
     # Before a width is usual, an edge that passes is not seen.
