@@ -283,10 +283,11 @@ def _jitter_variance(recent, block, row, own2, weight, alike):
 
 @kernel(_nrt=False)
 def _edge_variance(recent, block, row, width, width2, known, usual):
-    """Return the variance of rows near an edge that passes, px squared; 0 while none is ``known``.
+    """Return the variance of rows near an edge that passes, px squared.
 
-    A line that has its ``usual`` width again for some profiles has passed the edge. ``width2`` is
-    the variance of the block's mean ``width``.
+    It is 0 while no usual width, or no recent one, is ``known``. A line that has its ``usual``
+    width again for some profiles has passed the edge. ``width2`` is the variance of the block's
+    mean ``width``.
     """
     least, most = min(recent.width[block], usual), max(recent.width[block], usual)
     since_steady = _changed_since_steady(recent, block, row, width, width2)
@@ -313,7 +314,8 @@ def _compare_with_recent(history, known, usual, width_variance):
             continue
         row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points
         own2, width2 = _near_sum(now.sigma2, block) / (points * points), width_variance / points
-        history.passing2[block] = _edge_variance(recent, block, row, width, width2, known, usual)
+        compared = known and recent.profiles[block] > 0.0
+        history.passing2[block] = _edge_variance(recent, block, row, width, width2, compared, usual)
         profiles = min(recent.profiles[block] + 1.0, RECENT_PROFILES)
         # The first profiles, of pixels just lit, soon count little.
         weight = 2.0 / (profiles + 1.0)

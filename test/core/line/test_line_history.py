@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
-from independent_pixels import ROWS, Camera, stream, wavy
+from independent_pixels import COLUMNS, ROWS, Camera, stream, wavy
 from reconstructing import reconstruct
+
+from eschorty_ros.core.reconstruction import profile_rows
 
 AHEAD_PX = 3.0
 ROW = 340.3
@@ -76,6 +78,24 @@ def test_sigma_of_a_line_in_the_middle_of_a_pixel_has_little_of_whole_pixels(hal
     print(f"sigma {sigma_px:.3f} px, error {error_px:.3f} px, seed {camera.seed}")
     # 2.8 and 2.0 where the variance is the mean over all rows.
     assert 0.8 < sigma_px / error_px < 1.6
+
+
+def test_the_first_profile_of_a_window_has_the_sigma_of_the_others(monkeypatch):
+    """A third of the columns has a bright, wide line: its width is not the usual one."""
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 600_000)
+    camera, bright = Camera(periods=120), np.arange(COLUMNS) < COLUMNS // 3
+
+    def line(lit, power):
+        return camera.line(lambda _, column: np.where(lit[column], ROW, np.nan), power)
+
+    found, _ = reconstruct(stream(line(bright, 1.0), line(~bright, 0.3)))
+    found = found.select((found.period > 40) & bright[found.column])
+    periods = np.unique(found.period)
+    sigma_px = np.array([np.median(found.sigma_row[found.period == k]) for k in periods])
+    ratio = sigma_px.max() / np.median(sigma_px)
+    print(f"sigma {np.median(sigma_px):.3f} px, at most {ratio:.1f} times that, seed {camera.seed}")
+    # 39 where the first width is compared with none before it.
+    assert ratio < 2.0
 
 
 def test_sigma_holds_what_the_edges_of_stripes_move():
