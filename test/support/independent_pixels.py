@@ -59,15 +59,16 @@ class Camera:
     def line(
         self,
         row: Callable[[int, NDArray[Any]], NDArray[Any]],
-        power: float = 1.0,
+        power: float | NDArray[np.float64] = 1.0,
         part: Callable[[int, NDArray[Any]], tuple[Any, Any]] = lambda _, __: (-ROWS, ROWS),
     ) -> Events:
         """Return the events of a line at ``row(period, columns)``; NaN is dark.
 
-        Only the ``part(period, columns)`` of its thickness, rows from its centre, falls on this
-        surface.
+        ``power`` is that of all columns or of each. Only the ``part(period, columns)`` of its
+        thickness, rows from its centre, falls on this surface.
         """
         column = np.arange(COLUMNS)
+        power = np.broadcast_to(power, column.shape)
         reach = max(REACH, round(2.4 * self.half_width_px))
         offset = np.arange(-reach, reach + 1)
         parts: list[Events] = []
@@ -80,7 +81,7 @@ class Camera:
             y, x, centre = y[seen], x[seen], np.broadcast_to(true_row, y.shape)[seen]
             low, high = part(k, x)
             inside = (y - centre >= low) & (y - centre < high)
-            brighter = self.contrast * power * self.light(y - centre) * inside
+            brighter = self.contrast * power[x] * self.light(y - centre) * inside
             swing = np.log1p(brighter)
             # Less light passes no pixel's threshold.
             able = swing > 0.25 * self.threshold

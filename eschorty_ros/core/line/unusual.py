@@ -60,12 +60,18 @@ _BESIDE = BLOCK_COLUMNS + BLOCK_COLUMNS // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
 # that is not smoothed.
 _MARKED = 2.5
+# Columns to either side that show the width of lines beside a column: more than an object has.
+_BROAD = 128
 
 
 class UsualWidths(NamedTuple):
-    """Points by width; ``typical`` are median and mode, and the median of second differences."""
+    """Points by width; ``typical`` are median and mode, and the median of second differences.
+
+    ``lacks2`` is what the squared width of a column's lines lacks, where the laser is weaker.
+    """
 
     number: NDArray[np.float64]
+    lacks2: NDArray[np.float64]
     typical: Any
 
 
@@ -94,7 +100,7 @@ class Widths(NamedTuple):
 def empty_widths(shape: tuple[int, int]) -> Widths:
     """Return no widths of profiles of a ``shape``."""
     return Widths(
-        usual=empty_usual_widths(),
+        usual=empty_usual_widths(shape[1]),
         below=np.zeros(_BINS + 1),
         static_width=np.full(shape, np.nan),
         last=np.full(shape, np.nan),
@@ -108,9 +114,10 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
     )
 
 
-def empty_usual_widths() -> UsualWidths:
+def empty_usual_widths(columns: int) -> UsualWidths:
     """Return no usual widths."""
-    return UsualWidths(np.zeros(_BINS), record("median", "mode", "difference", value=0.0))
+    typical = record("median", "mode", "difference", value=0.0)
+    return UsualWidths(np.zeros(_BINS), np.zeros(columns), typical)
 
 
 @kernel
@@ -120,10 +127,22 @@ def _width_bin(width):
 
 @kernel(_nrt=True)
 def _keep_widths(widths, known):
-    """Keep the usual widths as ``known`` ones, which count as many profiles."""
+    """Keep the usual widths as ``known`` ones, which count as many profiles.
+
+    With the squared width of steady lines is kept what that beside a column lacks.
+    """
     points, usual = _PROFILES_KNOWN * widths.last.shape[1], widths.usual
     known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
     known.typical.difference = usual.typical.difference
+    squares = widths.steady[0] ** 2
+    steady, known.lacks2[:] = np.flatnonzero(~np.isnan(squares)), 0.0
+    median = np.nanmedian(squares)
+    # It changes little from a column to those beside.
+    for c in steady[::4]:
+        # As many on both sides: the median of what falls evenly is that of the middle.
+        reach = max(min(c - steady[0], steady[-1] - c, _BROAD), _BROAD // 4)
+        near = squares[max(c - reach, 0) : c + reach + 1]
+        known.lacks2[c : c + 4] = median - np.nanmedian(near)
 
 
 @kernel
@@ -173,7 +192,7 @@ def _update(widths, columns):
 @kernel
 def _restart_widths(widths, known):
     """Clear all widths but the ``known`` ones, zeros where there are none."""
-    widths.usual.number[:] = known.number
+    widths.usual.number[:], widths.usual.lacks2[:] = known.number, known.lacks2
     widths.usual.typical.difference = known.typical.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
@@ -224,22 +243,31 @@ def _mixed_variance(rows, smoothing, k, c, sigma_width):
     return mixed2 if wider and 2.0 * (variance - beside * beside) > mixed2 else 0.0
 
 
+@kernel
+def _even_width(widths, k, c):
+    """Return the width of a line as it would be with as much light as in most columns."""
+    return np.sqrt(max(widths.static_width[k, c] ** 2 + widths.usual.lacks2[c], 0.0))
+
+
 @kernel(_nrt=False)
 def _oblique_variance(smoothing, widths, k, c, sigma_width):
     """Return the variance of a row at an edge that is oblique to the line, px squared, else 0.
 
     Such an edge leaves more of the line from column to column, and one end where it is: row and
-    width change together.
+    width change together, and not as the light on the columns does.
     """
     before, after = c - APART, c + APART
     if before < 0 or after >= smoothing.row.shape[1]:
         return 0.0
-    width, missing = widths.static_width, widths.usual.typical.mode - widths.static_width[k, c]
+    width, mode, least = widths.static_width, widths.usual.typical.mode, STEADY * sigma_width
     wider = abs(width[k, after] - width[k, before])
     moved = abs(smoothing.row[k, after] - smoothing.row[k, before])
     at_edge = 0.5 * PER_WIDTH * wider < moved < 2.0 * PER_WIDTH * wider
-    unlike = min(missing, wider) > STEADY * sigma_width
-    return (PER_WIDTH * missing) ** 2 if unlike and at_edge else 0.0
+    if not at_edge or min(mode - width[k, c], wider) <= least:
+        return 0.0
+    missing = mode - max(width[k, c], _even_width(widths, k, c))
+    wider = abs(_even_width(widths, k, after) - _even_width(widths, k, before))
+    return (PER_WIDTH * missing) ** 2 if min(missing, wider) > least else 0.0
 
 
 @kernel
@@ -404,7 +432,10 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
-    return max(edge2, _unusual_variance(width, widths.usual.typical.mode)), weight
+    even, mode = _even_width(widths, k, c), widths.usual.typical.mode
+    if _is_usual(widths.below, even, reach):
+        return edge2, weight
+    return max(edge2, min(_unusual_variance(width, mode), _unusual_variance(even, mode))), weight
 
 
 @kernel(_nrt=False)

@@ -226,7 +226,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         bursts=empty_bursts(model.columns),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
-        known_widths=empty_usual_widths(),
+        known_widths=empty_usual_widths(model.columns),
         scatter=empty_scatter(model.columns, FACTOR_MAX if windowed else 0.0),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
