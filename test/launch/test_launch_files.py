@@ -120,6 +120,30 @@ def test_the_launch_ends_with_an_error_after_a_node_was_killed(launched):
     assert process.wait(30.0) == 1, output()
 
 
+PUSHED = """
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_ros.actions import PushRosNamespace
+def generate_launch_description():
+    scan = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource({file!r}),
+        launch_arguments=[("auto_scan", "false"), ("parameters", {parameters!r})],
+    )
+    return LaunchDescription([PushRosNamespace("robot"), scan])
+"""
+
+
+def test_nodes_in_a_pushed_namespace_take_the_parameter_file(launched, tmp_path):
+    parameters, including = tmp_path / "lab.yaml", tmp_path / "robot.launch.py"
+    parameters.write_text("/eschorty/reconstruction: {ros__parameters: {trigger_source: none}}")
+    file = str(LAUNCH / "scan.launch.py")
+    including.write_text(PUSHED.format(file=file, parameters=str(parameters)))
+    _, output = launched(including)
+    wait_until(lambda: "trigger source" in output(), "the reconstruction's line")
+    assert "trigger source none, events /robot/eschorty/camera/events" in output()
+
+
 def test_rviz_shows_our_topics_with_our_quality_of_service():
     view = yaml.safe_load((ROOT / "config" / "scan.rviz").read_text())["Visualization Manager"]
     assert view["Global Options"]["Fixed Frame"] == "eschorty_base"

@@ -96,8 +96,7 @@ class Description:
     """The nodes, bench and view that a launch file starts."""
 
     nodes: Tables
-    """Parameters by node; those of ``file`` override them."""
-    file: str
+    """Parameters by node."""
     bench: dict[str, str] | None
     """Options of ``eschorty-bench``; ``None`` without an emulated bench."""
     view: str
@@ -152,7 +151,8 @@ def replay(given: Mapping[str, str]) -> Description:
     values = _with_file(nodes, given)
     with _naming("recording"):
         # The settings of the recorded scan, unless the file has others.
-        nodes["reconstruction"] |= load_recording(values["replay"]["recording"]).settings
+        settings = load_recording(values["replay"]["recording"]).settings
+    nodes["reconstruction"] = settings | nodes["reconstruction"]
     return _described(given, nodes, None)
 
 
@@ -201,7 +201,7 @@ def _described(given: Mapping[str, str], nodes: Tables, built: str | None) -> De
     if built is not None and given["fake"] == "true":
         bench = {name: given[name] for name in ("scene", "pixels", "effects", "trigger")}
         bench["calibration"] = built
-    return Description(nodes, given["parameters"], bench, view)
+    return Description(nodes, bench, view)
 
 
 def _check_choices(arguments: tuple[Param, ...], given: Mapping[str, str]) -> None:
@@ -234,11 +234,13 @@ _READERS: dict[type, Callable[[str], Any]] = {
 
 
 def _with_file(nodes: Tables, given: Mapping[str, str]) -> Tables:
-    """Return every parameter of the nodes: of the file, of the arguments, or its default."""
+    """Add the file's parameters to those of the arguments; return them with all defaults."""
     with _naming("parameters"):
         file = read_parameters(given["parameters"])
+    for name, table in nodes.items():
+        table |= file.get(name, {})
     return {
-        name: {param.name: param.default for param in TABLES[name]} | table | file.get(name, {})
+        name: {param.name: param.default for param in TABLES[name]} | table
         for name, table in nodes.items()
     }
 

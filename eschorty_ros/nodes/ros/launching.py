@@ -44,7 +44,7 @@ def description(arguments: Sequence[Any], check: Callable[[Mapping[str, str]], A
         names = [argument.name for argument in arguments]
         _check_names(context.argv, names)
         plan = check({name: context.launch_configurations[name] for name in names})
-        return _entities(plan)
+        return _entities(plan, context.launch_configurations.get("ros_namespace", ""))
 
     declared = [
         DeclareLaunchArgument(
@@ -69,7 +69,8 @@ def _check_names(given: Sequence[str], names: list[str]) -> None:
             raise ArgumentError(f"argument {name} is unknown; did you mean {near[0]}?")
 
 
-def _entities(plan: Any) -> list[Any]:
+def _entities(plan: Any, pushed: str) -> list[Any]:
+    """Return the processes; ``pushed`` is the namespace that an including launch file gives."""
     environment = launched_environment()
     processes = [
         Node(
@@ -82,10 +83,11 @@ def _entities(plan: Any) -> list[Any]:
             # Texts stay texts, also where they could be numbers.
             parameters=[
                 {
-                    key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+                    key.replace(f"./{NAMESPACE}/", f".{pushed}/{NAMESPACE}/"): (
+                        ParameterValue(value, value_type=str) if isinstance(value, str) else value
+                    )
                     for key, value in parameters.items()
-                },
-                plan.file,
+                }
             ],
             output="screen",
             emulate_tty=True,

@@ -104,8 +104,9 @@ def test_the_page_has_every_argument_with_its_default() -> None:
         assert f"`{argument.default}`" in line or "`config/" in line
 
 
-def test_another_driver_in_place_of_the_camera() -> None:
-    given = Given("scan", camera="false", fake="false", trigger="none", frequency="80")
+def test_another_driver_in_place_of_the_camera(tmp_path: Path) -> None:
+    given = Given("scan", camera="false", fake="false", trigger="none", frequency="80",
+                  parameters=written(tmp_path, ""))  # fmt: skip
     plan = launch_arguments.scan(given)
     assert "camera" not in plan.nodes
     assert plan.bench is None
