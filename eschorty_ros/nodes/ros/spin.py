@@ -31,6 +31,7 @@ from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.dds_deadlock import DdsDeadlock, DdsDeadlockError
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.freed_memory import FreedMemory
+from eschorty_ros.nodes.ros.unused import refuse_unused
 
 _START_TURN_S = 0.1
 # An error of a timer ends the node after half a second at most; each turn wakes the process.
@@ -167,6 +168,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         spinning = Spinning(threads)
         for factory in factories:
             nodes.append(factory())
+            refuse_unused(nodes[-1], words)
             spinning.executor.add_node(nodes[-1])
         second = SecondNodes(nodes)
         second.wait()

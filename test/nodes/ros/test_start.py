@@ -11,8 +11,11 @@ import rclpy
 from ros_process import NodeProcess, Observer, domain_environment, wait_until
 
 from eschorty_ros.hardware.base.launcher import VARIABLE
+from eschorty_ros.nodes.laser.node import TABLE
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.parameters import Parameters
 from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.unused import refuse_unused
 from eschorty_ros.nodes.scanner.node import ScannerNode
 
 LASER, SCANNER = "eschorty_ros.nodes.laser.node", "eschorty_ros.nodes.scanner.node"
@@ -111,6 +114,44 @@ def test_ros_that_does_not_start_is_one_line(tmp_path: Path, arguments, environm
     (line,) = (ended.stdout + ended.stderr).strip().splitlines()
     assert words in line, line
     assert len(line) <= 300
+
+
+def test_a_file_that_names_the_node_in_another_namespace_only_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "lab.yaml"
+    file.write_text("/eschorty/laser: {ros__parameters: {high_max_v: 3.3}}")
+    ended = subprocess.run(
+        [sys.executable, "-m", LASER, "--ros-args", "-r", "__ns:=/unit", "-p", "auto_start:=false",
+         "--params-file", str(file)],
+        env=domain_environment(free_domain()),
+        capture_output=True,
+        text=True,
+        timeout=20.0,
+    )  # fmt: skip
+    assert ended.returncode == 1
+    (line,) = (ended.stdout + ended.stderr).strip().splitlines()
+    assert "lab.yaml has parameters of /eschorty/laser and none of /unit/laser" in line
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        "/**: {ros__parameters: {high_max_v: 3.3}}",
+        "/front/laser: {ros__parameters: {high_max_v: 3.3, of_another: 1}}",
+        "{/eschorty/laser: {ros__parameters: {duty: 0.4}}, /unit/laser: {ros__parameters: {}}}",
+    ],
+)
+def test_a_file_for_other_nodes_too_is_taken(tmp_path: Path, entries: str) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(entries)
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=free_domain())
+    node = rclpy.create_node("laser", namespace="/unit", context=context)
+    try:
+        Parameters(node, TABLE)
+        refuse_unused(node, ["--ros-args", "--params-file", str(file)])
+    finally:
+        node.destroy_node()
+        context.shutdown()
 
 
 def assert_refused(second: NodeProcess, name: str) -> None:
