@@ -279,6 +279,8 @@ class ScannerNode(Node):
         scanning = not self._idle.is_set()
         values = {"scans": self._scans, "scanning": scanning, "last": self._last}
         failed = not scanning and End.ABORTED.value in self._last
+        if scanning and (lacking := self._client.waits_for):
+            return diagnostics.WARN, f"the scan waits: {lacking}", values
         level = diagnostics.WARN if failed else diagnostics.OK
         return level, "scanning" if scanning else self._last, values
 

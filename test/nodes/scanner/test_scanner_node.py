@@ -4,13 +4,14 @@ import time
 
 import pytest
 from delayed_laser import DelayedLaser
+from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import Scan
-from ros_process import NAMESPACE, nodes_here
+from ros_process import NAMESPACE, nodes_here, wait_until
 from scan_scenarios import Goals
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.nodes.laser.node import LaserNode
-from eschorty_ros.nodes.ros import drivers
+from eschorty_ros.nodes.ros import drivers, qos
 from eschorty_ros.nodes.scanner.node import ScannerNode
 
 GOAL = {"start": 0.01, "stop": 0.02, "speed": 0.05}
@@ -38,9 +39,14 @@ def test_scans_of_two_units_in_one_graph_have_different_names(observer, start):
 
 
 def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(observer, start):
+    reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
     goals = scans(observer, start, use_sim_time=True)
     goals.start(**GOAL)
     goals.wait_for(lambda feedback: "/clock" in feedback.waits_for, "the missing clock")
+    wait_until(
+        lambda: any("scan waits: " in array.status[0].message for array in list(reports)),
+        "the missing clock in the diagnostics",
+    )
 
 
 class Lost(DelayedLaser):
