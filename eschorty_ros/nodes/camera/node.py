@@ -232,10 +232,12 @@ class CameraNode(DeviceNode):
 
     def _dump_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         source = self._source
-        values = source.statistics() | self._packets.losses if source is not None else {}
-        response.success = source is not None
-        response.message = ", ".join(f"{name} {value:g}" for name, value in values.items())
-        self.get_logger().info(f"statistics: {response.message or 'the camera is not open'}")
+        response.message = "the camera is not open; configure it first"
+        if source is not None:
+            response.success = True
+            values = source.statistics() | self._packets.losses
+            response.message = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        self.get_logger().info(f"statistics: {response.message}")
         return response
 
     def _on_laser(self, message: LaserState) -> None:

@@ -161,6 +161,9 @@ def test_absent_camera_is_waited_for(start: Start) -> None:
     run = start(plugged=False)
     status = run.status(lambda s: "waiting" in s.message, "waiting in the diagnostics")
     assert "EVK4 camera: no such device on the bus; check cable, power and serial" in status.message
+    statistics = run.observer.call(Trigger, "camera/dump_statistics")
+    assert not statistics.success
+    assert "the camera is not open" in statistics.message
     plug(BUS, run.model)
     run.active()
 
