@@ -291,7 +291,7 @@ class ReconstructionNode(Node):
         values = self.parameters
         if not values["record"]:
             return None
-        parent = Path(values["record"]).expanduser()
+        parent = Path(values["record"]).expanduser().resolve()
         folder = parent / (values["record_name"] or scan_id)
         if folder in self._scans.recordings:
             folder = parent / scan_id

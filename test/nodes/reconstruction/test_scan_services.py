@@ -1,6 +1,7 @@
 """The services around a scan of one's own camera and stage."""
 
 import math
+import os
 import time
 from types import SimpleNamespace
 
@@ -38,7 +39,7 @@ def devices():
 def renamed(tmp_path):
     """As ``devices``, for another camera driver's topic, with recordings, the first one named."""
     topic = "/event_camera/events"
-    parameters = {"frequency": 70.0, "record": tmp_path, "record_name": "a"}
+    parameters = {"frequency": 70.0, "record": os.path.relpath(tmp_path), "record_name": "a"}
     with (
         Observer() as observer,
         NodeProcess(
@@ -131,6 +132,7 @@ def test_a_refused_scan_leaves_no_folder_and_its_name_to_the_next(renamed, tmp_p
     answer = begin(observer, "next")
     assert answer.success, answer.message
     wait_until(lambda: [path.name for path in tmp_path.iterdir()] == ["next"], "its folder alone")
+    assert end(observer, "next").recording == str(tmp_path / "next")
 
 
 def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
