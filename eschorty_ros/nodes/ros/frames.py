@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.nodes.ros.parameters import Param
 
 FRAME_PREFIX = Param(
@@ -23,5 +24,10 @@ class Frames(NamedTuple):
 
 
 def frames(prefix: str) -> Frames:
-    """Return the frames' names with a prefix."""
+    """Return the frames' names with a prefix.
+
+    Raises ``ArgumentError`` for one that begins with a slash: tf2 takes no such name.
+    """
+    if prefix.startswith("/"):
+        raise ArgumentError(f"frame_prefix is {prefix!r}; tf2 takes no slash at the beginning")
     return Frames(*(prefix + name for name in Frames._fields))

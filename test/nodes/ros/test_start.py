@@ -42,7 +42,12 @@ def test_an_unknown_parameter_is_refused_by_every_node(node: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
-    [("controller", "foo", "kbd101"), ("odom_rate", "fast", "100.0"), ("bay", 99, "bay")],
+    [
+        ("controller", "foo", "kbd101"),
+        ("odom_rate", "fast", "100.0"),
+        ("bay", 99, "bay"),
+        ("frame_prefix", "/left_", "no slash"),
+    ],
 )
 def test_a_value_that_is_refused_is_one_line(name: str, value: object, words: str) -> None:
     with NodeProcess(
