@@ -28,6 +28,7 @@ from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.spin import end_nodes, signals_ignored
+from eschorty_ros.nodes.ros.unused import refuse_unused
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
 from eschorty_ros.nodes.viewer.node import ViewerNode
@@ -188,6 +189,7 @@ def _running(
     try:
         for factory in factories:
             nodes.append(factory())
+            refuse_unused(nodes[-1], ())
         nodes.append(client := Node("eschorty_client"))
         # Before the nodes spin: an executor must not use a client that is being made.
         made = Composition(client, nodes, ActionClient(client, kind, action), spinning)

@@ -10,18 +10,23 @@ from rclpy.node import Node
 
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.yaml_file import read_yaml
+from eschorty_ros.nodes.ros.parameters import check_name
 
 
 def refuse_unused(node: Node, words: Sequence[str]) -> None:
-    """Refuse a parameter file that names the node in other namespaces only.
+    """Refuse quality of service of no topic, and a parameter file that names the node elsewhere.
 
-    ROS leaves its values out silently: a limit of the laser's voltage would have no effect. A
-    file's entry of the same name counts when all its parameters are those of the node.
+    ROS leaves them out silently: a limit of the laser's voltage would have no effect. A file's
+    entry of the node's name in another namespace counts when all its parameters are those of the
+    node, and the file has no entry of the node itself.
 
     - ``words``: The process's command line.
 
-    Raises ``ArgumentError`` with the file and both names.
+    Raises ``ArgumentError`` with what is refused and what was probably meant.
     """
+    declared = list(node.get_parameters_by_prefix(""))
+    for name in node._parameter_overrides:
+        check_name(name, f"parameter of {node.get_name()}", declared)
     full = node.get_fully_qualified_name()
     for option, path in pairwise(words):
         if option == "--params-file" and full not in (entries := _entries(path)):

@@ -121,6 +121,18 @@ def test_ros_that_does_not_start_is_one_line(tmp_path: Path, arguments, environm
     assert len(line) <= 300
 
 
+def test_quality_of_service_of_no_topic_is_refused() -> None:
+    name = "qos_overrides.{}/camera/events.subscription.reliability"
+    with NodeProcess(
+        "eschorty_ros.nodes.reconstruction.node",
+        {name.format(""): "reliable"},
+        domain=free_domain(),
+    ) as process:
+        assert process.wait() == 1
+        line = process.output.splitlines()[-1]
+    assert f"did you mean {name.format('/eschorty')}?" in line
+
+
 def test_a_file_that_names_the_node_in_another_namespace_only_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "lab.yaml"
     file.write_text("/eschorty/laser: {ros__parameters: {high_max_v: 3.3}}")
