@@ -104,6 +104,8 @@ def fill_result(result: Calibrate.Result, report: CalibrationReport, file: str) 
 
 
 def _value(calibration: Calibration, name: str) -> float:
+    if name == "principal_column":
+        return calibration.model().principal_column
     return calibration.object_scale_mm if name == "k_mm" else float(getattr(calibration, name))
 
 
