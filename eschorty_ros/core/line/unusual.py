@@ -67,11 +67,11 @@ _BROAD = 128
 class UsualWidths(NamedTuple):
     """Points by width; ``typical`` are median and mode, and the median of second differences.
 
-    ``lacks2`` is what the squared width of a column's lines lacks, where the laser is weaker.
+    ``scale`` is the width of lines over that of those beside a column, more where it is weaker.
     """
 
     number: NDArray[np.float64]
-    lacks2: NDArray[np.float64]
+    scale: NDArray[np.float64]
     typical: Any
 
 
@@ -117,7 +117,7 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
 def empty_usual_widths(columns: int) -> UsualWidths:
     """Return no usual widths."""
     typical = record("median", "mode", "difference", value=0.0)
-    return UsualWidths(np.zeros(_BINS), np.zeros(columns), typical)
+    return UsualWidths(np.zeros(_BINS), np.ones(columns), typical)
 
 
 @kernel
@@ -129,20 +129,19 @@ def _width_bin(width):
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles.
 
-    With the squared width of steady lines is kept what that beside a column lacks.
+    With them is kept how much wider steady lines are than those beside a column.
     """
     points, usual = _PROFILES_KNOWN * widths.last.shape[1], widths.usual
     known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
     known.typical.difference = usual.typical.difference
-    squares = widths.steady[0] ** 2
-    steady, known.lacks2[:] = np.flatnonzero(~np.isnan(squares)), 0.0
-    median = np.nanmedian(squares)
+    steady, median = np.flatnonzero(~np.isnan(widths.steady[0])), np.nanmedian(widths.steady[0])
+    known.scale[:] = 1.0
     # It changes little from a column to those beside.
     for c in steady[::4]:
         # As many on both sides: the median of what falls evenly is that of the middle.
         reach = max(min(c - steady[0], steady[-1] - c, _BROAD), _BROAD // 4)
-        near = squares[max(c - reach, 0) : c + reach + 1]
-        known.lacks2[c : c + 4] = median - np.nanmedian(near)
+        near = widths.steady[0, max(c - reach, 0) : c + reach + 1]
+        known.scale[c : c + 4] = median / np.nanmedian(near)
 
 
 @kernel
@@ -192,7 +191,7 @@ def _update(widths, columns):
 @kernel
 def _restart_widths(widths, known):
     """Clear all widths but the ``known`` ones, zeros where there are none."""
-    widths.usual.number[:], widths.usual.lacks2[:] = known.number, known.lacks2
+    widths.usual.number[:], widths.usual.scale[:] = known.number, known.scale
     widths.usual.typical.difference = known.typical.difference
     widths.last[:], widths.last_row[:], widths.same_width[:] = np.nan, np.nan, np.nan
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
@@ -243,12 +242,6 @@ def _mixed_variance(rows, smoothing, k, c, sigma_width):
     return mixed2 if wider and 2.0 * (variance - beside * beside) > mixed2 else 0.0
 
 
-@kernel
-def _even_width(widths, k, c):
-    """Return the width of a line as it would be with as much light as in most columns."""
-    return np.sqrt(max(widths.static_width[k, c] ** 2 + widths.usual.lacks2[c], 0.0))
-
-
 @kernel(_nrt=False)
 def _oblique_variance(smoothing, widths, k, c, sigma_width):
     """Return the variance of a row at an edge that is oblique to the line, px squared, else 0.
@@ -265,8 +258,9 @@ def _oblique_variance(smoothing, widths, k, c, sigma_width):
     at_edge = 0.5 * PER_WIDTH * wider < moved < 2.0 * PER_WIDTH * wider
     if not at_edge or min(mode - width[k, c], wider) <= least:
         return 0.0
-    missing = mode - max(width[k, c], _even_width(widths, k, c))
-    wider = abs(_even_width(widths, k, after) - _even_width(widths, k, before))
+    scale = widths.usual.scale
+    missing = mode - max(width[k, c], scale[c] * width[k, c])
+    wider = abs(scale[after] * width[k, after] - scale[before] * width[k, before])
     return (PER_WIDTH * missing) ** 2 if min(missing, wider) > least else 0.0
 
 
@@ -432,7 +426,7 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
-    even, mode = _even_width(widths, k, c), widths.usual.typical.mode
+    even, mode = widths.usual.scale[c] * width, widths.usual.typical.mode
     if _is_usual(widths.below, even, reach):
         return edge2, weight
     return max(edge2, min(_unusual_variance(width, mode), _unusual_variance(even, mode))), weight

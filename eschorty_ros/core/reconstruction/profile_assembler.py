@@ -132,7 +132,8 @@ class ProfileAssembler:
         known["computations"] = known["all_cut"] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
-        self._memory.known_widths.number[:] = self._memory.known_widths.lacks2[:] = 0.0
+        self._memory.known_widths.number[:] = 0.0
+        self._memory.known_widths.scale[:] = 1.0
         self._memory.known_widths.typical["difference"] = 0.0
         _end(self._boxed_memory)
 
