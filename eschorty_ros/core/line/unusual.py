@@ -140,8 +140,9 @@ def _keep_widths(widths, known):
     for c in steady[::4]:
         # As many on both sides: the median of what falls evenly is that of the middle.
         reach = max(min(c - steady[0], steady[-1] - c, _BROAD), _BROAD // 4)
-        near = widths.steady[0, max(c - reach, 0) : c + reach + 1]
-        known.scale[c : c + 4] = median / np.nanmedian(near)
+        beside = np.nanmedian(widths.steady[0, max(c - reach, 0) : c + reach + 1])
+        # A line of a single row has no width.
+        known.scale[c : c + 4] = median / beside if beside > 0.0 else 1.0
 
 
 @kernel
