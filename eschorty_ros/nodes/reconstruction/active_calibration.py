@@ -24,6 +24,7 @@ from eschorty_ros.core.optics import (
 )
 from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
 from eschorty_ros.nodes.reconstruction.calibration_messages import active_message
+from eschorty_ros.nodes.reconstruction.parameters import expanded_folder
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 
@@ -50,7 +51,7 @@ class ActiveCalibration:
         use: Use,
     ) -> None:
         self.calibration = calibration
-        self.folder = Path(folder).expanduser() if folder else _home()
+        self.folder = expanded_folder("calibration_folder", folder) if folder else _home()
         self._node = node
         self._paths = paths
         self._use = use

@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from event_camera_msgs.msg import EventPacket
@@ -39,7 +38,8 @@ from eschorty_ros.nodes.reconstruction.inputs import packet_from_message
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.reconstruction.parameters import (
     TABLE,
-    check_record_name,
+    check_recording,
+    expanded_folder,
     modulation_override,
 )
 from eschorty_ros.nodes.reconstruction.reports import Reports
@@ -90,7 +90,7 @@ class ReconstructionNode(Node):
         finally:
             slow.cancel()
         self._override = modulation_override(self.parameters)
-        check_record_name(self.parameters["record_name"])
+        check_recording(self.parameters)
         self._pipeline = Pipeline(
             self.calibration,
             self._settings,
@@ -291,10 +291,10 @@ class ReconstructionNode(Node):
         values = self.parameters
         if not values["record"]:
             return None
-        parent = Path(values["record"]).expanduser().resolve()
-        folder = parent / (values["record_name"] or scan_id)
-        if folder in self._scans.recordings:
-            folder = parent / scan_id
+        parent = expanded_folder("record", values["record"])
+        path = parent / (values["record_name"] or scan_id)
+        if path in self._scans.recordings:
+            path = parent / scan_id
         log = ScanLog(
             scan_id=scan_id,
             start_mm=start_mm,
@@ -303,7 +303,7 @@ class ReconstructionNode(Node):
             stage_gap_s=float(values["stage_gap"]),
         )
         settings = dataclasses.asdict(settings_of(values, Settings))
-        return ScanRecorder(folder, log, self.calibration, settings)
+        return ScanRecorder(path, log, self.calibration, settings)
 
     # The worker.
 
@@ -377,7 +377,7 @@ class ReconstructionNode(Node):
         self._scans.finish()
 
     def _on_change(self, values: dict[str, Any]) -> None:
-        check_record_name(values["record_name"])
+        check_recording(values)
         settings = settings_of(values, Settings)
         override = modulation_override(values)
         self._post(partial(self._use_settings, settings))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from eschorty_ros.control.calibration_sequence import CAPTURE_MAX_S
@@ -62,7 +63,22 @@ def modulation_override(values: Mapping[str, Any]) -> Modulation | None:
     return Modulation(values["frequency"], values["duty"], values["waveform"])
 
 
-def check_record_name(name: str) -> None:
-    """Raise ``ArgumentError`` unless the name, if any, is one in the folder of recordings."""
+def expanded_folder(name: str, path: str) -> Path:
+    """Return the folder that the parameter ``name`` gives, whose ``~`` is the home folder.
+
+    Raises ``ArgumentError`` where there is no such home.
+    """
+    try:
+        return Path(path).expanduser().resolve()
+    except RuntimeError:
+        raise ArgumentError(
+            f"{name} is {path!r}; there is no such home folder, give the whole path"
+        ) from None
+
+
+def check_recording(values: Mapping[str, Any]) -> None:
+    """Raise ``ArgumentError`` unless a recording has, if any, a folder and a name in it."""
+    expanded_folder("record", values["record"])
+    name = values["record_name"]
     if name and (fault := bare_name_fault("record_name", name)):
         raise ArgumentError(fault)
