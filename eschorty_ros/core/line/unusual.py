@@ -67,7 +67,7 @@ _BROAD = 128
 class UsualWidths(NamedTuple):
     """Points by width; ``typical`` are median and mode, and the median of second differences.
 
-    ``scale`` is the width of lines over that of those beside a column, more where it is weaker.
+    ``scale`` is the width of lines over that of those beside a column, 1 where these are wider.
     """
 
     number: NDArray[np.float64]
@@ -129,7 +129,7 @@ def _width_bin(width):
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles.
 
-    With them is kept how much wider steady lines are than those beside a column.
+    With them is kept how much wider steady lines are than those beside a column, if they are.
     """
     points, usual = _PROFILES_KNOWN * widths.last.shape[1], widths.usual
     known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
@@ -141,8 +141,8 @@ def _keep_widths(widths, known):
         # As many on both sides: the median of what falls evenly is that of the middle.
         reach = max(min(c - steady[0], steady[-1] - c, _BROAD), _BROAD // 4)
         beside = np.nanmedian(widths.steady[0, max(c - reach, 0) : c + reach + 1])
-        # A line of a single row has no width.
-        known.scale[c : c + 4] = median / beside if beside > 0.0 else 1.0
+        # Wider lines have other light in them, and one of a single row has no width.
+        known.scale[c : c + 4] = max(median / beside, 1.0) if beside > 0.0 else 1.0
 
 
 @kernel
@@ -260,7 +260,7 @@ def _oblique_variance(smoothing, widths, k, c, sigma_width):
     if not at_edge or min(mode - width[k, c], wider) <= least:
         return 0.0
     scale = widths.usual.scale
-    missing = mode - max(width[k, c], scale[c] * width[k, c])
+    missing = mode - scale[c] * width[k, c]
     wider = abs(scale[after] * width[k, after] - scale[before] * width[k, before])
     return (PER_WIDTH * missing) ** 2 if min(missing, wider) > least else 0.0
 
