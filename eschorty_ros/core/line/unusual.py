@@ -255,14 +255,13 @@ def _oblique_variance(smoothing, widths, k, c, sigma_width):
         return 0.0
     width, mode, least = widths.static_width, widths.usual.typical.mode, STEADY * sigma_width
     wider = abs(width[k, after] - width[k, before])
-    moved = abs(smoothing.row[k, after] - smoothing.row[k, before])
-    at_edge = 0.5 * PER_WIDTH * wider < moved < 2.0 * PER_WIDTH * wider
-    if not at_edge or min(mode - width[k, c], wider) <= least:
+    if not min(mode - width[k, c], wider) > least:
         return 0.0
-    scale = widths.usual.scale
+    moved, scale = abs(smoothing.row[k, after] - smoothing.row[k, before]), widths.usual.scale
+    at_edge = 0.5 * PER_WIDTH * wider < moved < 2.0 * PER_WIDTH * wider
     missing = mode - scale[c] * width[k, c]
-    wider = abs(scale[after] * width[k, after] - scale[before] * width[k, before])
-    return (PER_WIDTH * missing) ** 2 if min(missing, wider) > least else 0.0
+    evenly = abs(scale[after] * width[k, after] - scale[before] * width[k, before])
+    return (PER_WIDTH * missing) ** 2 if at_edge and min(missing, evenly) > least else 0.0
 
 
 @kernel
