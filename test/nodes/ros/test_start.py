@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -107,16 +108,8 @@ def test_words_before_ros_args_are_refused(capsys, given: list[str]) -> None:
 def test_ros_that_does_not_start_is_one_line(tmp_path: Path, arguments, environment, words) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("a: [1")
-    ended = subprocess.run(
-        [sys.executable, "-m", SCANNER, "--ros-args",
-         *(argument.format(broken=broken) for argument in arguments)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60.0,
-    )  # fmt: skip
-    assert ended.returncode == 1
-    (line,) = (ended.stdout + ended.stderr).strip().splitlines()
+    given = [argument.format(broken=broken) for argument in arguments]
+    line = refusal(SCANNER, given, {**os.environ, **environment})
     assert words in line, line
     assert len(line) <= 300
 
@@ -136,16 +129,8 @@ def test_quality_of_service_of_no_topic_is_refused() -> None:
 def test_a_file_that_names_the_node_in_another_namespace_only_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "lab.yaml"
     file.write_text("/eschorty/laser: {ros__parameters: {high_max_v: 3.3}}")
-    ended = subprocess.run(
-        [sys.executable, "-m", LASER, "--ros-args", "-r", "__ns:=/unit", "-p", "auto_start:=false",
-         "--params-file", str(file)],
-        env=domain_environment(free_domain()),
-        capture_output=True,
-        text=True,
-        timeout=20.0,
-    )  # fmt: skip
-    assert ended.returncode == 1
-    (line,) = (ended.stdout + ended.stderr).strip().splitlines()
+    given = ["-r", "__ns:=/unit", "-p", "auto_start:=false", "--params-file", str(file)]
+    line = refusal(LASER, given, domain_environment(free_domain()))
     assert "lab.yaml has parameters of /eschorty/laser and none of /unit/laser" in line
 
 
@@ -169,6 +154,20 @@ def test_a_file_for_other_nodes_too_is_taken(tmp_path: Path, entries: str) -> No
     finally:
         node.destroy_node()
         context.shutdown()
+
+
+def refusal(module: str, arguments: list[str], environment: Mapping[str, str]) -> str:
+    """Return the one line with which a node ends at its start."""
+    ended = subprocess.run(
+        [sys.executable, "-m", module, "--ros-args", *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+    )
+    assert ended.returncode == 1
+    (line,) = (ended.stdout + ended.stderr).strip().splitlines()
+    return line
 
 
 def assert_refused(second: NodeProcess, name: str) -> None:
