@@ -18,7 +18,7 @@ from eschorty_ros.nodes.ros.border import saturated
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 PACKETS_EXPECTED_S = 5.0
-"""Time from the node's start after which a camera without packets is a warning."""
+"""Time without packets, since the node's start or the last one, after which that is a warning."""
 _REMINDER_S = 30.0
 
 
@@ -33,7 +33,7 @@ class Reports:
     def __init__(self, node: Node, pipeline: Pipeline, jobs: JobQueue) -> None:
         self.faults = 0
         self.packet_ages = StampAges("camera")
-        self._begun_s = time.monotonic()
+        self._packets, self._arrived_s = 0, time.monotonic()
         self._node = node
         self._pipeline = pipeline
         self._jobs = jobs
@@ -93,12 +93,15 @@ class Reports:
         # Read once: meanwhile the worker may take the packets.
         if waits_for := stream.waits_for if stream.held else "":
             return diagnostics.WARN, f"packets wait for the {waits_for}", values
+        silent_s = self._silent_s()
+        if stream.packets and silent_s > PACKETS_EXPECTED_S:
+            return diagnostics.WARN, f"no packets for {silent_s:.0f} s; check the camera", values
         if stream.epoch is not None and stream.epoch.edges_missing:
             return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
         if warnings := [*self._new_losses(), *stream.warnings]:
             return diagnostics.WARN, "; ".join(warnings), values
         if not stream.packets:
-            late = time.monotonic() > self._begun_s + PACKETS_EXPECTED_S
+            late = silent_s > PACKETS_EXPECTED_S
             if late:
                 topic = self._node.resolve_topic_name("camera/events")
                 self._node.get_logger().warning(
@@ -107,6 +110,13 @@ class Reports:
                 )
             return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values
         return diagnostics.OK, "reconstructing", values
+
+    def _silent_s(self) -> float:
+        """Return the time without packets as far as the calls of ``diagnose`` show it."""
+        now_s, packets = time.monotonic(), self._pipeline.stream.packets
+        if packets != self._packets:
+            self._packets, self._arrived_s = packets, now_s
+        return now_s - self._arrived_s
 
     def _new_losses(self) -> list[str]:
         """Return a line for each loss since the last call; log that of points."""

@@ -1,5 +1,6 @@
 """Diagnostics of the reconstruction node."""
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -93,6 +94,27 @@ def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
     monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.0)
     assert reports.diagnose()[:2] == (diagnostics.WARN, "no packets yet")
     assert "no packets on /driver/events yet" in logged[0]
+
+
+def test_packets_that_no_longer_come_are_a_warning_after_some_seconds(monkeypatch):
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    pipeline.stream.announce_zero(0)
+    pipeline.stream.set_laser(Modulation(70.0), 1_000_000)
+    node = SimpleNamespace(create_publisher=lambda *_: None)
+    reports = Reports(node, pipeline, JobQueue(1))
+    rng = np.random.default_rng(3)
+    data = encoded(line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=1000))
+    half = len(data) // 2 & ~1
+    pipeline.stream.add(Packet(0, 0, data[:half]), 0.0)
+    pipeline.complete(0.0)
+    monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.01)
+    assert reports.diagnose()[:2] == (diagnostics.OK, "reconstructing")
+    time.sleep(0.02)
+    expected = "no packets for 0 s; check the camera"
+    assert reports.diagnose()[:2] == (diagnostics.WARN, expected)
+    pipeline.stream.add(Packet(1, 0, data[half:]), 0.0)
+    pipeline.complete(0.0)
+    assert reports.diagnose()[:2] == (diagnostics.OK, "reconstructing"), "seed 3"
 
 
 @pytest.mark.parametrize("taken", [False, True])
