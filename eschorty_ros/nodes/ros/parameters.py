@@ -22,11 +22,14 @@ from rclpy.exceptions import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.base.numbers import short
 
-_OF_ROS = ("qos_overrides", "start_type_description_service", "use_sim_time")
+_QOS = "qos_overrides"
+_DEPTH_MAX = 1_000_000
+_OF_ROS = (_QOS, "start_type_description_service", "use_sim_time")
 
 Settings = TypeVar("Settings")
 Value = bool | int | float | str | tuple[int, ...]
@@ -170,9 +173,11 @@ class Parameters(Mapping[str, Any]):
         self._table = {param.name: param for param in table}
         self._on_change = on_change
         # ROS ignores an unknown name: a misspelt safety limit would have no effect.
-        for name in node._parameter_overrides:
+        for name, given in node._parameter_overrides.items():
             if not of_ros(name):
                 check_name(name, f"parameter of {node.get_name()}", tuple(self._table))
+            elif name.startswith(f"{_QOS}."):
+                _check_quality(name, given.value)
         for param in self._table.values():
             _declare(node, param)
             param.check(self[param.name])
@@ -214,6 +219,24 @@ class Parameters(Mapping[str, Any]):
         except EschortyError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+
+def _check_quality(name: str, value: Any) -> None:
+    """Raise ``ArgumentError`` unless ``value`` is one of a policy that ``qos.overridable`` has.
+
+    rclpy would end with a traceback.
+    """
+    params = {
+        "depth": Param(name, 1, "", minimum=1, maximum=_DEPTH_MAX),
+        "history": Param(name, "keep_last", "", choices=_words(HistoryPolicy)),
+        "reliability": Param(name, "reliable", "", choices=_words(ReliabilityPolicy)),
+    }
+    if param := params.get(name.rpartition(".")[2]):
+        param.check(value.lower() if isinstance(value, str) else value)
+
+
+def _words(policy: Any) -> tuple[str, ...]:
+    return tuple(word for word in policy.short_keys() if word != "unknown")
 
 
 def _declare(node: Node, param: Param) -> None:

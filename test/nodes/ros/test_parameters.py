@@ -43,3 +43,26 @@ def test_values_that_stand_for_none_are_one_line(name, value):
         declared(**{name: value}),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    ("policy", "value", "words"),
+    [
+        ("reliability", "foo", "choose one of .*best_effort"),
+        ("history", True, "keep_last"),
+        ("depth", "deep", "type int"),
+        ("depth", 0, "range is 1 to"),
+    ],
+)
+def test_a_quality_of_service_that_no_topic_can_have_is_one_line(policy, value, words):
+    name = f"qos_overrides./camera/events.publisher.{policy}"
+    with (
+        pytest.raises(ArgumentError, match=f"parameter {name} is .*{words}"),
+        declared(**{name: value}),
+    ):
+        pass
+
+
+def test_a_quality_of_service_may_be_written_in_capitals():
+    with declared(**{"qos_overrides./camera/events.publisher.reliability": "RELIABLE"}):
+        pass
