@@ -301,8 +301,9 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
             break
         locked = triggered and missed < _MISSED_MAX
         deadline_us = predicted_us + tolerance_us if triggered else predicted_us
-        if taken < triggers_us.size and triggers_us[taken] <= deadline_us:
-            edge_us = triggers_us[taken]
+        trigger_us = triggers_us[taken] if taken < triggers_us.size else watermark_us
+        if trigger_us <= deadline_us and trigger_us < watermark_us:
+            edge_us = trigger_us
             taken += 1
             if locked and edge_us < predicted_us - tolerance_us:
                 spurious += 1

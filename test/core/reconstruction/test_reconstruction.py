@@ -87,6 +87,7 @@ def _split_cases():
     return {
         "edge": (data, known, Settings()),
         "estimate": (data, Modulation(500.0), Settings()),
+        "late trigger": (encoded(events, edges[30:]), Modulation(500.0), Settings()),
         "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
         "filter": (data, known, Settings(noise_filter="activity")),
         "gate": (data, known, Settings(phase_gate_us=500)),
