@@ -34,15 +34,28 @@ class Cut(NamedTuple):
 
 
 def next_cut(
-    words: NDArray[np.uint16], cut: Cut, edges_us: NDArray[np.int64], events: int, decoder: Decoder
+    words: NDArray[np.uint16],
+    cut: Cut,
+    edges_us: NDArray[np.int64],
+    events: int,
+    through: bool,
+    decoder: Decoder,
 ) -> Cut | None:
     """Return the first cut at an edge that at least ``events`` events lie before, from ``cut`` on.
 
-    ``None`` where there is none, or a trigger is before it. ``decoder`` is at ``cut``; its state
-    becomes that of the cut returned, its counts have no meaning.
+    ``None`` where there is none, or without ``through`` a trigger is before it. ``decoder`` is at
+    ``cut``; its state becomes that of the cut returned, its counts have no meaning.
     """
-    found = Cut(*_find(words, *cut, edges_us, events, decoder.memory))
+    found = Cut(*_find(words, *cut, edges_us, events, through, decoder.memory))
     return None if found.word < 0 else found
+
+
+def pass_over(words: NDArray[np.uint16], until_us: int, decoder: Decoder) -> int:
+    """Decode ``words`` without their events; return the number of words read.
+
+    It ends before the first event at ``until_us`` or later, and before a trigger.
+    """
+    return int(_pass_words_over(words, until_us, decoder.memory))
 
 
 class _Block(NamedTuple):
@@ -63,6 +76,12 @@ def _pass_over(sink, n, t_us, column, row, polarity):
 
 
 _decode_over = decode_into(_pass_over, "over")
+
+
+@entry_kernel
+def _pass_words_over(words, until_us, memory):
+    """Return the number of words decoded."""
+    return np.int64(_decode_over(words, np.uint64(0), until_us, False, memory, 0)[0])
 
 
 @kernel(_nrt=False)
@@ -88,7 +107,7 @@ def _scan(words, begin, end):
 
 
 @entry_kernel
-def _find(words, word, edge, edges_us, events, memory):
+def _find(words, word, edge, edges_us, events, through, memory):
     """Advance the decoder to the next cut after ``events`` events; return it, -1 for none.
 
     ``memory`` is the decoder's at ``word``, the beginning of the open window.
@@ -127,19 +146,19 @@ def _find(words, word, edge, edges_us, events, memory):
         begin = at - np.uintp(_LEAD)
         if has_base and base_at < begin:
             near = words[base_at : base_at + np.uintp(_BASE_LEAD)]
-            _decode_over(near, none, _FOREVER_US, False, memory, 0)
+            _decode_over(near, none, _FOREVER_US, through, memory, 0)
         k = (blocks - lead) % (lead + 1)
         s.run, s.epoch_us, s.high, s.low, s.held_high = _RUNNING, epochs[k], highs[k], 0, -1
         s.t_us, s.floor_us = epochs[k], epochs[k]
         s.row, s.limit, s.triple, s.others_parts = _NO_ROW, 0, 0, 0
     else:
         begin = np.uintp(word)
-    i, _, _ = _decode_over(words[:at], np.uint64(begin), _FOREVER_US, False, memory, 0)
+    i, _, _ = _decode_over(words[:at], np.uint64(begin), _FOREVER_US, through, memory, 0)
     if i < np.uint64(at):
         return Cut(-1, edge)
     while edge < edges_us.size:
         if edges_us[edge] > s.floor_us:
-            i, n, _ = _decode_over(words, i, edges_us[edge], False, memory, 0)
+            i, n, _ = _decode_over(words, i, edges_us[edge], through, memory, 0)
             total += np.int64(n)
             if i == np.uint64(size) or words[i] >> 12 == w3.EXT_TRIGGER:
                 break

@@ -143,6 +143,12 @@ class Decoder:
         trigger_t, channel, edge = self._memory.triggers
         return Events(t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m]))
 
+    def copied(self) -> Decoder:
+        """Return a decoder in the same state, with nothing counted."""
+        copy = Decoder(self.width, self.height)
+        copy.go_on_from(self)
+        return copy
+
     def go_on_from(self, other: Decoder) -> None:
         """Take over the state of ``other``, without its counts."""
         self._numbers[: len(_STATE)] = other._numbers[: len(_STATE)]

@@ -349,7 +349,7 @@ def _decode(words, i, until_us, through, memory, sink):
     """Decode ``words`` from ``i`` on; return the next index, the numbers of events and triggers.
 
     The pass stops before the first event at ``until_us`` or later, and without ``through`` before
-    the first trigger.
+    the first trigger. Triggers are stored as far as their arrays have room.
     """
     width, height, s, c, _, triggers = memory
     end = np.uint64(words.size)
@@ -454,9 +454,10 @@ def _decode(words, i, until_us, through, memory, sink):
             if not through:
                 i -= one
                 break
-            triggers.t[m] = t
-            triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
-            triggers.edge[m] = np.uint8(word & np.uint32(1))
+            if m < np.uint64(triggers.t.size):
+                triggers.t[m] = t
+                triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
+                triggers.edge[m] = np.uint8(word & np.uint32(1))
             m += one
         elif kind == w3.VECT_8:
             # It belongs to a triple whose first words are missing.

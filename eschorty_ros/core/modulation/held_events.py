@@ -20,6 +20,9 @@ Arrays = tuple[NDArray[Any], ...]
 """Times in us (int64), columns (uint16), rows (uint16) and polarities (uint8)."""
 
 
+NO_EVENTS: Arrays = tuple(np.empty(0, dtype) for dtype in _DTYPES)
+
+
 def sample(events: Sequence[NDArray[Any]], most: int) -> Arrays:
     """Return less than twice as many events as ``most``, evenly spread."""
     stride = max(events[0].size // most, 1)

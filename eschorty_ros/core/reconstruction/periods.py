@@ -9,8 +9,9 @@ from eschorty_ros.core.evt3 import Decoder, Events
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.edges import EDGES_MAX
-from eschorty_ros.core.modulation.held_events import Arrays, HeldEvents
+from eschorty_ros.core.modulation.held_events import NO_EVENTS, Arrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
+from eschorty_ros.core.reconstruction.edge_recorder import EdgeRecorder
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
 from eschorty_ros.core.reconstruction.profile_length import ProfileLength
 from eschorty_ros.core.reconstruction.windows import WindowAssembler
@@ -26,6 +27,8 @@ class PeriodCutter:
 
     - ``every``: Periods per profile; 0 chooses them from the first events.
     - ``assembler``: Takes the events and the periods' beginnings.
+
+    Public attribute ``recorder``: Takes them instead while it is set.
     """
 
     def __init__(
@@ -36,6 +39,7 @@ class PeriodCutter:
         self._length = ProfileLength(modulation)
         self._held = HeldEvents()
         self._assembler = assembler
+        self.recorder: EdgeRecorder | None = None
 
     @property
     def counters(self) -> dict[str, int]:
@@ -46,6 +50,10 @@ class PeriodCutter:
             "periods_empty": self.lock.schedule.periods_jumped,
             **self.lock.counters,
         }
+
+    @property
+    def _sink(self) -> ProfileAssembler | WindowAssembler | EdgeRecorder:
+        return self._assembler if self.recorder is None else self.recorder
 
     def add(self, events: Events, watermark_us: int) -> None:
         """Assign ``events``; none before ``watermark_us`` is still to come."""
@@ -69,7 +77,7 @@ class PeriodCutter:
             and not schedule.triggered
             and schedule.first_trigger_us is None
             and not self.lock.observes
-            and self._assembler.has_begun
+            and self._sink.has_begun
         )
 
     def add_words(self, words: NDArray[np.uint16], decoder: Decoder, floor_us: int) -> int:
@@ -78,7 +86,7 @@ class PeriodCutter:
         Fewer than all are read before a trigger and where the next edges are not known. Events
         before ``floor_us`` count as at that time.
         """
-        assembler, lock, schedule = self._assembler, self.lock, self.lock.schedule
+        sink, lock, schedule = self._sink, self.lock, self.lock.schedule
         now_us, read, stopped = floor_us, 0, True
         while stopped and self._knows_ahead():
             ahead_us = _AHEAD_US if words.size <= PASS_WORDS else END_OF_STREAM_US // 2
@@ -89,10 +97,10 @@ class PeriodCutter:
                 if held[0][-1] >= end_us:
                     break
                 used = int(np.searchsorted(edges_us, held[0][-1], "right"))
-                assembler.merge(held, _part(held, 0, 0), Edges(edges_us[:used], indices[:used]))
+                sink.merge(held, NO_EVENTS, Edges(edges_us[:used], indices[:used]))
                 edges = Edges(edges_us[used:], indices[used:])
                 self._held.drop(len(self._held))
-            count, more = assembler.merge_words(words[read:], decoder, span, edges)
+            count, more = sink.merge_words(words[read:], decoder, span, edges)
             read, used = read + int(count), used + more
             stopped = read < words.size and int(words[read]) >> 12 != EXT_TRIGGER
             now_us = max(decoder.settled_us or 0, decoder.newest_us + 1)
@@ -100,8 +108,7 @@ class PeriodCutter:
                 now_us = max(now_us, (decoder.time_us or 0) + 1)
             edges_us, indices = schedule.advance(lock.limit(now_us))
             if len(edges_us) > used:
-                nothing = _part(held, 0, 0)
-                assembler.merge(nothing, nothing, Edges(edges_us[used:], indices[used:]))
+                sink.merge(NO_EVENTS, NO_EVENTS, Edges(edges_us[used:], indices[used:]))
             if not lock.close_block(now_us) and stopped:
                 lock.skip_to(now_us - 1)
         return read
@@ -128,8 +135,7 @@ class PeriodCutter:
         return True
 
     def _assign_held(self, watermark_us: int) -> None:
-        t, x, y, p = self._held.arrays
-        self._assign((t[:0], x[:0], y[:0], p[:0]), watermark_us)
+        self._assign(NO_EVENTS, watermark_us)
 
     def _assign(self, new: Arrays, watermark_us: int) -> None:
         """Assign the events certain before the watermark, held ones first; hold back the rest."""
@@ -150,7 +156,7 @@ class PeriodCutter:
                 before, after = _part(held.arrays, 0, ready), _part(new, first, end)
                 for t, _, _, p in (before, after):
                     lock.observe(t, p)
-                self._assembler.merge(before, after, Edges(edges_us, indices))
+                self._sink.merge(before, after, Edges(edges_us, indices))
                 held.drop(ready)
                 first = end
             more = len(edges_us) == EDGES_MAX or lock.close_block(watermark_us)

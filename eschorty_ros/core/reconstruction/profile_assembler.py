@@ -30,7 +30,7 @@ from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.background_gate import background_gate_us
-from eschorty_ros.core.modulation.held_events import Arrays
+from eschorty_ros.core.modulation.held_events import NO_EVENTS, Arrays
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profile_rows import (
@@ -58,12 +58,14 @@ class Edges(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends where the estimate of the line starts again
-    (`WINDOW_EVENTS`), or as soon as the usual widths are known.
+    The pass ends before a trigger unless it goes ``through``. With ``one_window`` it ends where
+    the estimate of the line starts again (`WINDOW_EVENTS`), or as soon as the usual widths are
+    known.
     """
 
     floor_us: int
     end_us: int
+    through: bool = False
     one_window: bool = False
 
 
@@ -217,7 +219,7 @@ class ProfileAssembler:
 
         Returns the numbers of words read and of edges used. Advances the decoder's state.
 
-        - ``span``: The pass stops before the first event at its end or later, and before a trigger.
+        - ``span``: The pass stops before the first event at its end or later.
         - ``edges``: Beginnings of periods before the span's end.
         """
         progress = _Progress(0, 0)
@@ -241,9 +243,8 @@ class ProfileAssembler:
     def close(self) -> None:
         """Close the open period if it has events; it stays open for further ones."""
         if self._state["status"] == FILLED:
-            none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
-            self.merge(none, none, again)
+            self.merge(NO_EVENTS, NO_EVENTS, again)
 
     def take(self) -> list[LineRows]:
         """Return the rows of the periods closed since the last call, in parts."""
@@ -401,9 +402,9 @@ def _pass(words, progress, decoder, span, edges, period, memory, before):
         bins = _bins(columns, part, gate.keeps_late > 0, state.edge_us, floor_us)
         limit_us = min(end_us, part.end_us)
         if takes_all:
-            end, events, _ = _decode_all_into_bins(words, i, limit_us, False, decoder, bins)
+            end, events, _ = _decode_all_into_bins(words, i, limit_us, span.through, decoder, bins)
         else:
-            end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
+            end, events, _ = _decode_into_bins(words, i, limit_us, span.through, decoder, bins)
         if _needs_room(columns):
             _copy(*before, columns.counts, decoder.numbers)
             state.full = 1
@@ -436,8 +437,8 @@ def _pass(words, progress, decoder, span, edges, period, memory, before):
 def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     """Decode words into the open period and those that begin at the edges.
 
-    It ends before the first event at the end of ``span`` or later, and before a trigger. Words
-    and edges remain when a column or the output has no room.
+    It ends before the first event at the end of ``span`` or later, and unless that goes through
+    before a trigger. Words and edges remain when a column or the output has no room.
     """
     period, decoder = boxed.content, boxed_decoder.content
     memory = period.memory.content

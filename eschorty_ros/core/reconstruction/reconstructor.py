@@ -16,6 +16,7 @@ from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.reconstruction.edge_recorder import EdgeRecorder
 from eschorty_ros.core.reconstruction.missing_points import missing_points
 from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
@@ -165,22 +166,51 @@ class Reconstructor:
         words, begin = self._decoder.words(byte_view("data", data)), 0
         if self._first_row:
             words = window_words(words, self._first_row)
+        settled = False
         while begin < words.size:
-            size = _PIECE_WORDS
-            if self._filter is None:
-                alone = self._jobs == 1 or self._periods.lock.tracks
-                read = self._add_words(words[begin:][: PASS_WORDS if alone else None])
+            left = words[begin:]
+            tracks = self._jobs > 1 and self._periods.lock.tracks
+            if settled and tracks and left.size > 2 * PASS_WORDS:
+                begin += self._add_tracked(left)
+                settled = False
+            else:
+                read, settled = self._add(left)
                 begin += read
-                if read:
-                    continue
-                size = _BLOCK_WORDS if self._periods.lock.observes else _PIECE_WORDS
-            events = self._decoded(words[begin : begin + size])
-            begin += size
-            if events is not None:
-                self._periods.add(self._filtered(events), self._watermark_us)
         for rows in self._assembler.take():
             self._hand_on(rows)
         del self._each
+
+    def _add_tracked(self, words: NDArray[np.uint16]) -> int:
+        """Track the phase over ``words``, then assemble them in windows; return the number read."""
+        decoder, floor_us = self._decoder.copied(), self._watermark_us
+        recorder, begin = EdgeRecorder(), 0
+        self._periods.recorder = recorder
+        while begin < words.size and begin - recorder.marked <= PASS_WORDS:
+            read, settled = self._add(words[begin:])
+            begin += read
+            if settled:
+                recorder.mark(begin)
+        self._periods.recorder = None
+        recorder.assemble(words, decoder, floor_us, self._assembler)
+        return begin
+
+    def _add(self, words: NDArray[np.uint16]) -> tuple[int, bool]:
+        """Assign the events of the first words to periods; return the number of words.
+
+        The second value is whether no event is held back.
+        """
+        size = _PIECE_WORDS
+        if self._filter is None:
+            alone = self._jobs == 1 or self._periods.lock.tracks
+            read = self._add_words(words[: PASS_WORDS if alone else None])
+            if read:
+                return read, True
+            size = _BLOCK_WORDS if self._periods.lock.observes else _PIECE_WORDS
+        piece = words[:size]
+        events = self._decoded(piece)
+        if events is not None:
+            self._periods.add(self._filtered(events), self._watermark_us)
+        return piece.size, False
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from eschorty_ros.core.evt3 import Decoder, Encoder
-from eschorty_ros.core.evt3.cuts import Cut, next_cut
+from eschorty_ros.core.evt3.cuts import Cut, next_cut, pass_over
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.profiles import place
@@ -39,4 +39,6 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
         reconstructor.push(piece)
     place(reconstructor.flush(), reconstructor.model, 0.0, calibration.stage_direction)
     decoder = Decoder(calibration.columns, calibration.rows)
-    next_cut(decoder.words(data), Cut(0, 0), np.zeros(1, np.int64), 1, decoder)
+    words = decoder.words(data)
+    next_cut(words, Cut(0, 0), np.zeros(1, np.int64), 1, False, decoder)
+    pass_over(words, 0, decoder)

@@ -116,10 +116,10 @@ class WindowAssembler:
         self._at, going = Cut(0, 0), True
         if self._open.is_learning:
             going = self._go_on()
-        probe, cut, left = _copy(decoder), self._at, self._open.events_left
+        probe, cut, left = decoder.copied(), self._at, self._open.events_left
         running = deque([self._start(cut, decoder, decoder, self._open)] if going else [])
         while going:
-            found = next_cut(words, cut, edges.t_us, left, probe)
+            found = next_cut(words, cut, edges.t_us, left, span.through, probe)
             if found is None:
                 break
             cut, left = found, profile_rows.WINDOW_EVENTS
@@ -129,7 +129,7 @@ class WindowAssembler:
                     break
             assembler = self._idle.popleft()
             assembler.begin_window(edges, cut.edge - 1, self._open)
-            running.append(self._start(cut, _copy(probe), _copy(probe), assembler))
+            running.append(self._start(cut, probe.copied(), probe.copied(), assembler))
         while running:
             going = self._accept(running.popleft(), going)
         while going:
@@ -196,10 +196,3 @@ class WindowAssembler:
         self._open, self._decoder = assembler, window.decoder
         self._hand_on(result)
         return assembler.window_is_over
-
-
-def _copy(decoder: Decoder) -> Decoder:
-    """Return a decoder in the same state, with nothing counted."""
-    copy = Decoder(decoder.width, decoder.height)
-    copy.go_on_from(decoder)
-    return copy

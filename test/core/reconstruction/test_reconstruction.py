@@ -1,6 +1,8 @@
 """Bytes to profiles: rows against the truth, splits, phase, scenes and counters."""
 
 import os
+import threading
+from collections import Counter
 from dataclasses import fields, replace
 
 import numpy as np
@@ -23,6 +25,7 @@ from eschorty_ros.core.reconstruction import (
     profile_length,
     profile_rows,
     reconstruct_recording,
+    reconstructor,
     region_window,
     windows,
 )
@@ -84,9 +87,16 @@ def _split_cases():
     late = sort_readout(*map(np.concatenate, zip(prompt, late, strict=True)))
     edges = 5000 + np.arange(40) * 2000 + rng.integers(-20, 21, 40)
     data, known = encoded(events), Modulation(500.0, on_edge_us=1000)
+    # Off for 9 s, and with another phase after it.
+    later = np.concatenate([events[0], events[0] + 9_000_700]), *(np.tile(v, 2) for v in events[1:])
+    fast = line_events(rng, flat, frequency_hz=500.2, periods=100, columns=100, edge_us=5000)
+    stray = np.sort(rng.integers(5000, 200_000, 30))
     return {
         "edge": (data, known, Settings()),
         "estimate": (data, Modulation(500.0), Settings()),
+        "dark": (encoded(later), Modulation(500.0), Settings()),
+        "drift": (encoded(fast), Modulation(500.0), Settings()),
+        "stage": (encoded(fast, stray), Modulation(500.0), Settings(trigger_source="stage")),
         "late trigger": (encoded(events, edges[30:]), Modulation(500.0), Settings()),
         "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
         "filter": (data, known, Settings(noise_filter="activity")),
@@ -122,6 +132,8 @@ def test_any_split_gives_the_same_points_and_counts(case):
 def test_threads_give_the_same_points_and_counts(case, monkeypatch):
     """With windows of a few periods each, so that there are many, in a stream with faults too."""
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
+    monkeypatch.setattr(reconstructor, "PASS_WORDS", 1 << 14)
+    monkeypatch.setattr(reconstructor, "_PIECE_WORDS", 1 << 12)
     rng = np.random.default_rng(SEED)
     more = {"returns": {"returns": "all"}, "compensation": {"reflectance_compensation": "on"}}
     stream, modulation, settings = SPLIT_CASES.get(case, SPLIT_CASES["edge"])
@@ -131,11 +143,36 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
     for data in (stream, faulty.tobytes()):
         half = len(data) // 2 + 1
         serial, a = reconstruct(data, modulation, settings, [half])
+        stage_edges = a.take_stage_edges()
         for jobs in (2, 5):
             parallel = Reconstructor(CALIBRATION, modulation, settings, jobs)
             parts = [parallel.push(data[k : k + half]) for k in range(0, len(data), half)]
             assert_same(serial, Profiles.concatenate([*parts, parallel.flush()]))
             assert a.counters == parallel.counters
+            for one, other in zip(stage_edges, parallel.take_stage_edges(), strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("case", ["estimate", "drift", "stage"])
+def test_threads_work_where_the_phase_is_tracked(case, monkeypatch):
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
+    monkeypatch.setattr(reconstructor, "PASS_WORDS", 1 << 14)
+    monkeypatch.setattr(reconstructor, "_PIECE_WORDS", 1 << 12)
+    assemble = windows.WindowAssembler._assemble
+    threads = Counter()
+
+    def counted(self, begin, decoder, assembler):
+        before = assembler.counters["events_binned"]
+        result = assemble(self, begin, decoder, assembler)
+        threads[threading.get_ident()] += assembler.counters["events_binned"] - before
+        return result
+
+    monkeypatch.setattr(windows.WindowAssembler, "_assemble", counted)
+    stream, modulation, settings = SPLIT_CASES[case]
+    parallel = Reconstructor(CALIBRATION, modulation, settings, 2)
+    parallel.push(stream)
+    threads.pop(threading.get_ident(), None)
+    assert threads.total() > 0.5 * parallel.counters["events"], f"seed {SEED}"
 
 
 def test_lines_have_their_usual_width_where_a_gate_changes(monkeypatch):
