@@ -22,6 +22,8 @@ _TURNS_ENOUGH = 60
 # So many events of a chunk show what all do.
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
+# Points whose median sigma is that of all.
+_SIGMAS = 1 << 16
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 # Latency of pixels, part of a period by which events may seem to be before their edge, and the
@@ -94,7 +96,8 @@ def recording_warnings(
     samples = recording.stage_samples
     found += stage_faults(recording, span_us)
     if len(points):
-        found += sampling_faults(recording, span_us, float(np.median(points["sigma"])) * 1e3)
+        sigma_mm = 1e3 * float(np.median(points["sigma"][:: len(points) // _SIGMAS + 1]))
+        found += sampling_faults(recording, span_us, sigma_mm)
     wrong_frequency = []
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
