@@ -6,8 +6,9 @@ import math
 import mmap
 import os
 import time
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -32,6 +33,8 @@ from eschorty_ros.core.storage.recording import SETTINGS_FILE, STAGE_FILE, TRUTH
 # Bytes of the file that are mapped at a time, in one thread and in several.
 _PASS_BYTES = 1 << 20
 _WINDOWS_BYTES = 1 << 27
+# Profiles that wait to be placed.
+_WAITING = 4
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
 _SPEED_MAX_MM_S = 10_000.0
@@ -100,12 +103,14 @@ def reconstruct_recording(
     with ExitStack() as files, ThreadPoolExecutor(1) as beside:
         pending = beside.submit(shown_modulation, recording) if jobs > 1 else None
         cloud = _Cloud(recording, reconstructor, folder, files)
+        add = _InTurn(beside if jobs > 1 else None, cloud.add)
         for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
-            _push(reconstructor, cloud.add, chunk, done, recording.marks)
+            _push(reconstructor, add, chunk, done, recording.marks)
             done += len(chunk)
             if progress is not None:
                 progress(done, total)
-        cloud.add(reconstructor.flush())
+        add(reconstructor.flush())
+        add.wait()
         profiles, points, organized = cloud.joined()
     origin_us = reconstructor.first_t_us or 0
     direction = recording.calibration.stage_direction
@@ -140,6 +145,29 @@ def reconstruct_recording(
         organized=organized,
         pass_lag=lag,
     )
+
+
+class _InTurn:
+    """Calls a function with one argument after the other, in the thread of a pool if there is one.
+
+    At most `_WAITING` calls wait.
+    """
+
+    def __init__(self, pool: ThreadPoolExecutor | None, call: Callable[[Any], Any]) -> None:
+        self._pool, self._call = pool, call
+        self._calls: deque[Future[Any]] = deque()
+
+    def __call__(self, argument: Any) -> None:
+        if self._pool is None:
+            self._call(argument)
+            return
+        self._calls.append(self._pool.submit(self._call, argument))
+        self.wait(_WAITING)
+
+    def wait(self, most: int = 0) -> None:
+        """Wait until at most so many calls are left; raise what one of them has raised."""
+        while len(self._calls) > most:
+            self._calls.popleft().result()
 
 
 class _Joined(NamedTuple):
