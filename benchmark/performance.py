@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,15 +69,16 @@ THREADS_TEXT = """
 
 `reconstruct_recording` as `eschorty reconstruct --jobs N` runs it, in a process of its own: the
 recording is read from the disk's cache and cut into windows of two million events, and each of N
-threads decodes windows and turns them into points, which go to a file. *Wall* is from the file to
-placed points and the check of the laser's frequency. The clouds are compared bit for bit. *Memory*
-is the most of its own that the process held (mapped pages of the files, which the system takes back
-when it needs them, are not its own), *before* what it held with everything imported and compiled,
-*points* the size of their file.
+threads decodes windows and turns them into points, which go to a file. An *estimated* phase of the
+laser, as that of recorded scans is, is tracked by one thread before the others begin. *Wall* is
+from the file to placed points and the check of the laser's frequency. The clouds are compared bit
+for bit. *Memory* is the most of its own that the process held (mapped pages of the files, which the
+system takes back when it needs them, are not its own), *before* what it held with everything
+imported and compiled, *points* the size of their file.
 """
 THREADS = (
-    "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",
-    "same points", "memory, MB", "before, MB", "points, MB",
+    "laser", "phase", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s",
+    "times one thread", "same points", "memory, MB", "before, MB", "points, MB",
 )  # fmt: skip
 LIVE_TEXT = """
 ## Through ROS 2
@@ -194,8 +196,10 @@ def one_thread(frequency_hz: float, seconds: float, repeats: int) -> str:
     )
 
 
-def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
-    """Return the rows of the second table for a recording."""
+def threads(recording: Path, modulation: Modulation, repeats: int) -> str:
+    """Return the rows of the second table for a recording with a laser."""
+    write_laser_yaml(recording / LASER_FILE, modulation)
+    phase = "estimated" if modulation.on_edge_us is None else "known"
     counts = sorted({1, 2, len(os.sched_getaffinity(0))})
     runs = [[measured(recording, jobs) for jobs in counts] for _ in range(repeats)]
     size_mb = (recording / EVENTS_FILE).stat().st_size / 1e6
@@ -206,10 +210,10 @@ def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
         equal = all(one.points == runs[0][0].points for one in same)
         events, memory_mb = same[0].events, max(one.memory_mb for one in same)
         rows += (
-            f"| {frequency_hz:g} Hz | {size_mb:.0f} | {events / 1e6:.1f} M | {jobs} | "
-            f"{wall_s:.2f} | {cpu:.2f} | {events / wall_s / 1e6:.0f} | {alone_s / wall_s:.2f} | "
-            f"{'yes' if equal else 'NO'} | {memory_mb:.0f} | {same[0].before_mb:.0f} | "
-            f"{same[0].points_mb:.0f} |\n"
+            f"| {modulation.frequency_hz:g} Hz | {phase} | {size_mb:.0f} | {events / 1e6:.1f} M | "
+            f"{jobs} | {wall_s:.2f} | {cpu:.2f} | {events / wall_s / 1e6:.0f} | "
+            f"{alone_s / wall_s:.2f} | {'yes' if equal else 'NO'} | {memory_mb:.0f} | "
+            f"{same[0].before_mb:.0f} | {same[0].points_mb:.0f} |\n"
         )
     return rows
 
@@ -247,7 +251,8 @@ def main() -> None:
             for number, repeats in ((1, arguments.repeats), (LARGE_BYTES // len(data), 1)):
                 name = f"{frequency_hz:g}_{number}"
                 recording = write_recording(Path(made) / name, modulation, data, number)
-                text += threads(recording, frequency_hz, repeats)
+                for laser in (modulation, replace(modulation, on_edge_us=None)):
+                    text += threads(recording, laser, repeats)
                 (recording / EVENTS_FILE).unlink()
     live = [sys.executable, str(Path(__file__).with_name("live.py"))]
     fast = ("--frequency", "70", "--packet-ms", "1", "--rate", "5")
