@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.kernel import entry_kernel, kernel
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.evt3.state_machine import _FOREVER_US, _NO_ROW, _RUNNING, decode_into
+from eschorty_ros.core.evt3.events import Triggers
+from eschorty_ros.core.evt3.state_machine import (
+    _FOREVER_US,
+    _NO_ROW,
+    _RUNNING,
+    _bounds,
+    decode_into,
+)
 
 BLOCK = 4096
 # Words decoded before a block, which hold the current row and time.
@@ -55,7 +62,15 @@ def pass_over(words: NDArray[np.uint16], until_us: int, decoder: Decoder) -> int
 
     It ends before the first event at ``until_us`` or later, and before a trigger.
     """
-    return int(_pass_words_over(words, until_us, decoder.memory))
+    return int(_pass_words_over(words, until_us, False, decoder.memory)[0])
+
+
+def triggers_of(words: NDArray[np.uint16], decoder: Decoder) -> Triggers:
+    """Decode ``words`` without their events; return the triggers."""
+    decoder.make_room(int(_bounds(words)[1]))
+    _, m = _pass_words_over(words, _FOREVER_US, True, decoder.memory)
+    t_us, channel, edge = decoder.memory.triggers
+    return Triggers(t_us[:m], channel[:m], edge[:m])
 
 
 class _Block(NamedTuple):
@@ -79,9 +94,10 @@ _decode_over = decode_into(_pass_over, "over")
 
 
 @entry_kernel
-def _pass_words_over(words, until_us, memory):
-    """Return the number of words decoded."""
-    return np.int64(_decode_over(words, np.uint64(0), until_us, False, memory, 0)[0])
+def _pass_words_over(words, until_us, through, memory):
+    """Return the numbers of words decoded and of triggers stored."""
+    i, _, m = _decode_over(words, np.uint64(0), until_us, through, memory, 0)
+    return np.int64(i), np.int64(m)
 
 
 @kernel(_nrt=False)

@@ -136,12 +136,16 @@ class Decoder:
             events, triggers = (int(bound) for bound in _bounds(words))
         if len(self._events.t) < events:
             self._events = event_arrays(events)
-        if len(self._memory.triggers.t) < triggers:
-            self._use(self._memory._replace(triggers=_trigger_arrays(triggers)))
+        self.make_room(triggers)
         n, m = _decode_events(words, self._memory, self._events)
         t, x, y, p = self._events
         trigger_t, channel, edge = self._memory.triggers
         return Events(t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m]))
+
+    def make_room(self, triggers: int) -> None:
+        """Make room for as many triggers of one pass."""
+        if len(self._memory.triggers.t) < triggers:
+            self._use(self._memory._replace(triggers=_trigger_arrays(triggers)))
 
     def copied(self) -> Decoder:
         """Return a decoder in the same state, with nothing counted."""

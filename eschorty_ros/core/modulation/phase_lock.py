@@ -176,7 +176,7 @@ class PhaseLock:
     @property
     def tracks(self) -> bool:
         """Return whether edges are moved by the events of each block."""
-        return self._block_end_us is not None
+        return self._block_end_us is not None and not self.schedule.triggered
 
     @property
     def observes(self) -> bool:

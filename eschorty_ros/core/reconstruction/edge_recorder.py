@@ -64,11 +64,12 @@ class EdgeRecorder:
         - ``decoder``: In the state before them.
         - ``floor_us``: Earlier events count as at that time.
         """
-        t_us, period = map(np.concatenate, zip(NO_EVENTS[:1] * 2, *self._edges, strict=True))
+        parts = zip(NO_EVENTS[:1] * 2, *self._edges, strict=True)
+        edges = Edges(*map(np.concatenate, parts))
         span = Span(floor_us, END_OF_STREAM_US, through=True)
         words = words[: self.marked]
-        _, used = assembler.merge_words(words, decoder, span, Edges(t_us, period))
-        assembler.merge(NO_EVENTS, NO_EVENTS, Edges(t_us[used:], period[used:]))
+        _, used = assembler.merge_words(words, decoder, span, edges)
+        assembler.merge(NO_EVENTS, NO_EVENTS, edges.part(used))
         for merge in self._merges:
             assembler.merge(*merge)
 

@@ -97,8 +97,8 @@ class PeriodCutter:
                 if held[0][-1] >= end_us:
                     break
                 used = int(np.searchsorted(edges_us, held[0][-1], "right"))
-                sink.merge(held, NO_EVENTS, Edges(edges_us[:used], indices[:used]))
-                edges = Edges(edges_us[used:], indices[used:])
+                sink.merge(held, NO_EVENTS, edges.part(0, used))
+                edges = edges.part(used)
                 self._held.drop(len(self._held))
             count, more = sink.merge_words(words[read:], decoder, span, edges)
             read, used = read + int(count), used + more
@@ -108,9 +108,33 @@ class PeriodCutter:
                 now_us = max(now_us, (decoder.time_us or 0) + 1)
             edges_us, indices = schedule.advance(lock.limit(now_us))
             if len(edges_us) > used:
-                sink.merge(NO_EVENTS, NO_EVENTS, Edges(edges_us[used:], indices[used:]))
+                sink.merge(NO_EVENTS, NO_EVENTS, Edges(edges_us, indices).part(used))
             if not lock.close_block(now_us) and stopped:
                 lock.skip_to(now_us - 1)
+        return read
+
+    def add_triggered(
+        self, words: NDArray[np.uint16], decoder: Decoder, floor_us: int, watermark_us: int
+    ) -> int:
+        """Do as `add_words` where triggers set the edges, all before ``watermark_us`` known."""
+        sink, lock, schedule = self._sink, self.lock, self.lock.schedule
+        read, more = 0, True
+        while more:
+            values = schedule.advance(lock.limit(watermark_us))
+            edges, held = Edges(*(each.copy() for each in values)), self._held.arrays
+            more = edges.t_us.size == EDGES_MAX
+            ready = int(np.searchsorted(held[0], schedule.safe_us))
+            if ready < len(self._held):
+                sink.merge(_part(held, 0, ready), NO_EVENTS, edges)
+                self._held.drop(ready)
+                continue
+            used = int(np.searchsorted(edges.t_us, held[0][-1], "right")) if ready else 0
+            sink.merge(held, NO_EVENTS, edges.part(0, used))
+            self._held.drop(ready)
+            span = Span(floor_us, schedule.safe_us, through=True)
+            count, later = sink.merge_words(words[read:], decoder, span, edges.part(used))
+            sink.merge(NO_EVENTS, NO_EVENTS, edges.part(used + later))
+            read += int(count)
         return read
 
     def finish(self, newest_us: int | None) -> None:

@@ -54,6 +54,10 @@ class Edges(NamedTuple):
     t_us: NDArray[np.int64]
     period: NDArray[np.int64]
 
+    def part(self, begin: int, end: int | None = None) -> Edges:
+        """Return the edges from number ``begin`` on, up to before ``end``."""
+        return Edges(self.t_us[begin:end], self.period[begin:end])
+
 
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer, short
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
+from eschorty_ros.core.evt3.cuts import triggers_of
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
@@ -183,9 +184,9 @@ class Reconstructor:
     def _add_tracked(self, words: NDArray[np.uint16]) -> int:
         """Track the phase over ``words``, then assemble them in windows; return the number read."""
         decoder, floor_us = self._decoder.copied(), self._watermark_us
-        recorder, begin = EdgeRecorder(), 0
+        recorder, lock, begin = EdgeRecorder(), self._periods.lock, 0
         self._periods.recorder = recorder
-        while begin < words.size and begin - recorder.marked <= PASS_WORDS:
+        while lock.tracks and begin < words.size and begin - recorder.marked <= PASS_WORDS:
             read, settled = self._add(words[begin:])
             begin += read
             if settled:
@@ -199,18 +200,35 @@ class Reconstructor:
 
         The second value is whether no event is held back.
         """
-        size = _PIECE_WORDS
+        size, lock = _PIECE_WORDS, self._periods.lock
         if self._filter is None:
-            alone = self._jobs == 1 or self._periods.lock.tracks
-            read = self._add_words(words[: PASS_WORDS if alone else None])
+            piece = words[: PASS_WORDS if self._jobs == 1 or lock.tracks else None]
+            if lock.schedule.triggered and piece.size > _PIECE_WORDS:
+                return self._add_triggered(piece), False
+            read = self._add_words(piece)
             if read:
                 return read, True
-            size = _BLOCK_WORDS if self._periods.lock.observes else _PIECE_WORDS
-        piece = words[:size]
-        events = self._decoded(piece)
+            size = _BLOCK_WORDS if lock.observes else _PIECE_WORDS
+        self._add_events(words[:size])
+        return min(size, words.size), False
+
+    def _add_triggered(self, words: NDArray[np.uint16]) -> int:
+        """Find the triggers in words, then assign all their events; return the number read."""
+        ahead = self._decoder.copied()
+        self._add_triggers(triggers_of(words, ahead))
+        watermark_us = max(self._watermark_us, ahead.settled_us or 0)
+        read = self._add_words(words, watermark_us)
+        for begin in range(read, words.size, _PIECE_WORDS):
+            self._add_events(words[begin : begin + _PIECE_WORDS], know_triggers=True)
+        return words.size
+
+    def _add_events(self, words: NDArray[np.uint16], *, know_triggers: bool = False) -> None:
+        """Decode and store the events of words, then assign those that are certain."""
+        events = self._decoded(words)
         if events is not None:
+            if len(events.triggers) and not know_triggers:
+                self._add_triggers(events.triggers)
             self._periods.add(self._filtered(events), self._watermark_us)
-        return piece.size, False
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
@@ -229,11 +247,18 @@ class Reconstructor:
     def _finished(self, rows: LineRows) -> Profiles:
         return self._with_ranges(self._compensated(self._with_reflectance(rows)))
 
-    def _add_words(self, words: NDArray[np.uint16]) -> int:
-        """Decode words into periods without storing the events; return the number read."""
+    def _add_words(self, words: NDArray[np.uint16], watermark_us: int | None = None) -> int:
+        """Decode words into periods without storing the events; return the number read.
+
+        - ``watermark_us``: Time before which all triggers are known, ``None`` without any.
+        """
         counts = self._decoder.memory.counts
         before = int(counts["events"])
-        read = self._periods.add_words(words, self._decoder, self._watermark_us)
+        pass_ = words, self._decoder, self._watermark_us
+        if watermark_us is None:
+            read = self._periods.add_words(*pass_)
+        else:
+            read = self._periods.add_triggered(*pass_, watermark_us)
         events = int(counts["events"]) - before
         if events:
             self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
@@ -256,8 +281,6 @@ class Reconstructor:
             self.newest_t_us = int(events.t[-1])
             self._counts["events"] += len(events)
         self._watermark_us = max(self._watermark_us, settled_us)
-        if len(events.triggers):
-            self._add_triggers(events.triggers)
         return events
 
     def _add_triggers(self, triggers: Triggers) -> None:

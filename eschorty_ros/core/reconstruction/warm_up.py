@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from eschorty_ros.core.evt3 import Decoder, Encoder
-from eschorty_ros.core.evt3.cuts import Cut, next_cut, pass_over
+from eschorty_ros.core.evt3.cuts import Cut, next_cut, triggers_of
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.profiles import place
@@ -41,4 +41,4 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     decoder = Decoder(calibration.columns, calibration.rows)
     words = decoder.words(data)
     next_cut(words, Cut(0, 0), np.zeros(1, np.int64), 1, False, decoder)
-    pass_over(words, 0, decoder)
+    triggers_of(words, decoder)

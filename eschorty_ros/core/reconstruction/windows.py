@@ -149,8 +149,7 @@ class WindowAssembler:
 
     def _assemble(self, begin: Cut, decoder: Decoder, assembler: ProfileAssembler) -> _Assembled:
         """Assemble a window from ``begin`` on."""
-        words, edges = self._words[begin.word :], self._edges
-        later = Edges(edges.t_us[begin.edge :], edges.period[begin.edge :])
+        words, later = self._words[begin.word :], self._edges.part(begin.edge)
         read, used = assembler.merge_words(words, decoder, self._span, later)
         return self._rows(assembler, Cut(int(begin.word + read), begin.edge + used))
 

@@ -86,6 +86,7 @@ def _split_cases():
     late = line_events(rng, flat, **slow, edge_us=8000, events=8.0, fwhm_px=60.0)
     late = sort_readout(*map(np.concatenate, zip(prompt, late, strict=True)))
     edges = 5000 + np.arange(40) * 2000 + rng.integers(-20, 21, 40)
+    disturbed = np.sort(np.append(np.delete(edges, range(10, 16)), rng.integers(5000, 85_000, 8)))
     data, known = encoded(events), Modulation(500.0, on_edge_us=1000)
     # Off for 9 s, and with another phase after it.
     later = np.concatenate([events[0], events[0] + 9_000_700]), *(np.tile(v, 2) for v in events[1:])
@@ -98,6 +99,7 @@ def _split_cases():
         "drift": (encoded(fast), Modulation(500.0), Settings()),
         "stage": (encoded(fast, stray), Modulation(500.0), Settings(trigger_source="stage")),
         "late trigger": (encoded(events, edges[30:]), Modulation(500.0), Settings()),
+        "stray trigger": (encoded(events, disturbed), Modulation(500.0), Settings()),
         "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
         "filter": (data, known, Settings(noise_filter="activity")),
         "gate": (data, known, Settings(phase_gate_us=500)),
