@@ -53,8 +53,9 @@ _CHANNELS = ("row", "width", "spacing")
 _MISFIT_PX = 10.0
 # Correlation of rows with range beyond which their sense is no error of some.
 _MIRRORED = 0.9
-# Times that a range may be outside those of the design: metres and micrometres are farther.
-_OTHER_UNIT = 50.0
+# Times that a range may be outside those of the design: centimetres are ten times nearer, and the
+# farthest range of a build is seldom more than three times its nearest.
+_OTHER_UNIT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +297,7 @@ def _refuse_undetermined(targets: Targets, design: RangeModel, names: tuple[str,
     if span < _SPAN_SIGMAS * sigma:
         raise FitError(
             f"the targets do not determine the build: their ranges differ by {span:g} mm and have "
-            f"a sigma of {sigma:g} mm; {_remedy(targets, design)}"
+            f"a sigma of {sigma:g} mm; give targets that move in range"
         )
     if set(names) == {WIDTH_BIAS}:
         raise ArgumentError(
@@ -325,7 +326,7 @@ def _refuse_unmoved(kept: Targets, design: RangeModel, found: CalibrationFit) ->
     raise FitError(
         f"the targets do not determine the build: rows {kept.row.min():.1f} to "
         f"{kept.row.max():.1f} at {low:g} to {high:g} mm, a difference of {expected:.1f} px by the "
-        f"design, would be k_prime_px = {model.k_prime_px:.4g}; {_remedy(kept, design)}"
+        f"design, would be k_prime_px = {model.k_prime_px:.4g}; give targets that move in range"
     )
 
 
@@ -337,13 +338,6 @@ def _refuse_misfit(found: CalibrationFit) -> None:
             f"the targets contradict each other: they are {times:.0f} times farther from any curve "
             "than their sigmas allow; check row and range_mm of each"
         )
-
-
-def _remedy(targets: Targets, design: RangeModel) -> str:
-    near_mm, far_mm = design.range_limits_mm
-    if targets.range_mm.max() < near_mm or targets.range_mm.min() > far_mm:
-        return f"give range_mm in millimetres, {near_mm:.0f} to {far_mm:.0f} by the design"
-    return "give targets that move in range"
 
 
 def _rejects_outliers(method: Method, robust: bool | None, size: int) -> bool:
