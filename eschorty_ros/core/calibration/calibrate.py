@@ -34,7 +34,7 @@ from eschorty_ros.core.calibration.fit import (
     fit,
 )
 from eschorty_ros.core.calibration.residuals import WIDTH_BIAS, Observed
-from eschorty_ros.core.calibration.robust import SCALE_MAX, inliers
+from eschorty_ros.core.calibration.robust import SCALE_MAX, contradicted, inliers
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import Calibration, RangeModel
 
@@ -335,8 +335,8 @@ def _refuse_misfit(found: CalibrationFit) -> None:
     times = math.sqrt(found.reduced_chi_square) if found.dof else 0.0
     if times > SCALE_MAX and np.abs(found.residual_px).max() > _MISFIT_PX:
         raise FitError(
-            f"the targets contradict each other: they are {times:.0f} times farther from any curve "
-            "than their sigmas allow; check row and range_mm of each"
+            f"the targets contradict {contradicted(found.free)}: they are {times:.0f} times "
+            "farther from any curve than their sigmas allow; check row and range_mm of each"
         )
 
 

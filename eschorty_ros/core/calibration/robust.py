@@ -100,7 +100,7 @@ def _cut(
         better = observed.known & kept[:, None] if kept.any() else observed.known
         scale = _scale(distance, better)
         before, kept = kept, np.abs(distance).max(axis=1) <= _CUT_SIGMA * scale
-        _refuse_contradictions(kept, scale, observed, _check(distance, observed.known))
+        _refuse_contradictions(kept, scale, observed, names, _check(distance, observed.known))
         if np.array_equal(kept, before):
             break
         part = Problem(observed.select(kept), design, names, priors, values)
@@ -134,11 +134,20 @@ def _check(distance: Array, known: Mask) -> str:
     )[int(np.argmax(medians))]
 
 
-def _refuse_contradictions(kept: Mask, scale: float, observed: Observed, check: str) -> None:
+def contradicted(names: tuple[str, ...]) -> str:
+    """Return what targets contradict that are far from every curve with these free parameters."""
+    if {"k_prime_px", "b_prime_px"} <= set(names):
+        return "each other"
+    return f"each other, or the design, of which {', '.join(names)} alone is free"
+
+
+def _refuse_contradictions(
+    kept: Mask, scale: float, observed: Observed, names: tuple[str, ...], check: str
+) -> None:
     if scale > SCALE_MAX:
         raise FitError(
-            f"the targets contradict each other: even the better half is {scale:.0f} times "
-            f"farther from any curve than their sigmas allow; check {check}"
+            f"the targets contradict {contradicted(names)}: even the better half is {scale:.0f} "
+            f"times farther from any curve than their sigmas allow; check {check}"
         )
     if 2 * int(kept.sum()) <= len(observed) or np.ptp(observed.range_mm[kept]) == 0.0:
         raise FitError(

@@ -218,6 +218,10 @@ def test_a_refusal_names_what_is_wrong():
     for share in (1e-3, 1 / 25.4, 0.1, 1e3, 1e6):
         wrong = given(range_mm=targets.range_mm * share, sigma_range_mm=1.0)
         refused(ArgumentError, wrong, match="target [19] is .*give millimetres, 785 to 2116")
+    for far in (targets, targets.select([0, 4, 8])):
+        alone = "contradict each other, or the design, of which b_mm alone is free"
+        with pytest.raises(FitError, match=alone):
+            calibrate(far, load_calibration("config_1"), free=("b_mm",))
     same, free = given(column=640.0), ("k_prime_px", "b_prime_px", "b_prime_1_px")
     none = dict.fromkeys(("b_prime_px", "b_prime_1_px"), math.inf)
     refused(FitError, same, free=free, prior_sigma=none, match="give targets in different columns")
