@@ -94,7 +94,8 @@ def parse_region(text: str) -> Region:
         return Region(_span(columns), _span(sweep))
     except ValueError:
         raise ArgumentError(
-            f"region {text!r} is not COLUMNS,SWEEP in px and mm; write it as 100:400,20:60"
+            f"region {text!r} is not COLUMNS,SWEEP in px and mm, each from low to high; write it "
+            "as 100:400,20:60"
         ) from None
 
 

@@ -176,8 +176,9 @@ def test_the_gap_of_surfaces_found_is_that_of_their_edges(step_mm, axis, gap_mm)
 
 def test_a_cloud_without_surfaces_and_bad_regions_have_one_line():
     points = cloud(lambda y, z: 1300.0 + 0.0 * z)
-    with pytest.raises(ArgumentError, match="write it as 100:400,20:60"):
-        parse_region("100-400")
+    for text in ("100-400", "400:100,:"):
+        with pytest.raises(ArgumentError, match="low to high; write it as 100:400,20:60"):
+            parse_region(text)
     with pytest.raises(ArgumentError, match=r"surface 2 has 0 points .* a region with 30 points"):
         measure(points, (parse_region(":100,:"), parse_region("1000:,:")))
     with pytest.raises(ArgumentError, match="give a cloud of a sweep"):
