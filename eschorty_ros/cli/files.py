@@ -9,7 +9,7 @@ import click
 
 from eschorty_ros.core.base.errors import ArgumentError
 
-IN_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+IN_FILE = click.Path(exists=True, path_type=Path)
 OUT_FILE = click.Path(dir_okay=False, path_type=Path)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 

@@ -125,6 +125,8 @@ def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Poin
 def stored_points(path: str | os.PathLike[str]) -> Points:
     """Read a cloud as `read_cloud` does; a height map remains one, shape (profiles, columns)."""
     source = file_path("path", path)
+    if source.is_dir():
+        raise FormatError(f"{source} is a folder; give a cloud, such as {source / 'cloud.pcd'}")
     header = _header_writer(source)
     with open_regular_file(source, FormatError) as stream:
         head = stream.read(_HEADER_LIMIT)

@@ -212,6 +212,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 def test_missing_files_and_other_extensions_are_named(tmp_path):
     with pytest.raises(FormatError, match=r"cannot read .*gone\.pcd"):
         read_cloud(tmp_path / "gone.pcd")
+    with pytest.raises(FormatError, match=r"is a folder; give a cloud, such as .*cloud\.pcd"):
+        read_cloud(tmp_path)
     for use in (partial(write_cloud, points=cloud(1)), read_cloud):
         with pytest.raises(ArgumentError, match=r"\.xyz"):
             use(tmp_path / "c.xyz")
