@@ -46,7 +46,7 @@ def curve_figure(report: CalibrationReport) -> Figure:
     curve, sigma = figure.subplots(1, 2)
     model, nominal = report.fit.model, report.nominal.model()
     rows = np.arange(float(model.rows))
-    curve.plot(rows, nominal.range_mm(rows), "--", color="0.5", label="nominal")
+    curve.plot(rows, nominal.range_mm(rows), "--", color="0.5", label="design")
     curve.plot(rows, model.range_mm(rows), color="C0", label="fitted")
     targets, used = report.targets, report.used
     size = _marker(report)
@@ -88,7 +88,7 @@ def residual_figure(report: CalibrationReport) -> Figure:
     size = _marker(report)
     in_rows.plot(at[used], residual[used], "o", color="C1", ms=size, label="used")
     if len(targets) <= _MANY:
-        in_rows.plot(at[used], alone[used], "o", mfc="none", color="C0", ms=8, label="left out")
+        in_rows.plot(at[used], alone[used], "o", mfc="none", color="C0", ms=8, label="without it")
     limit = 1.3 * float(np.nanmax(np.abs([*band, *residual[used], *alone[used]])))
     _rejected(in_rows, at[~used], residual[~used], limit, size)
     in_rows.set(
@@ -135,7 +135,7 @@ def magnification_figure(report: CalibrationReport) -> Figure:
     model, nominal, targets = report.fit.model, report.nominal.model(), report.targets
     pixel_mm = model.pixel_um * 1e-3
     for build, style, colour, name in (
-        (nominal, "--", "0.5", "nominal"), (model, "-", "C0", "fitted"),
+        (nominal, "--", "0.5", "design"), (model, "-", "C0", "fitted"),
     ):  # fmt: skip
         ends = np.array([0.0, -build.b_prime_px])
         axes.plot(ends, build.magnification(ends), style, color=colour, label=name)
@@ -173,7 +173,7 @@ def _profile(axes: Axes, report: CalibrationReport) -> None:
     )
     axes.axhline(limit, color="C3", ls="--", label="95 %")
     axes.axvline(report.fit.model.k_mm, color="C1", label="fitted")
-    axes.axvline(report.nominal.object_scale_mm, color="0.5", ls="--", label="nominal")
+    axes.axvline(report.nominal.object_scale_mm, color="0.5", ls="--", label="design")
     axes.set(
         xlabel="k (mm)", ylabel="chi-square above its minimum", title="k from the targets",
         ylim=(0.0, 4.0 * limit),
@@ -221,10 +221,10 @@ def _ellipses(axes: Axes, report: CalibrationReport, pair: tuple[str, str]) -> N
     design = [0.0 if n == WIDTH_BIAS else getattr(report.nominal.model(), n) for n in pair]
     inside = all(low <= v <= high for v, (low, high) in zip(design, limits, strict=True))
     if inside:
-        axes.plot(*design, "D", color="0.4", ms=5, label="nominal")
+        axes.plot(*design, "D", color="0.4", ms=5, label="design")
     outer = np.sqrt(np.diag(fit.covariance)[at])
     off = (np.array(design) - centre) / outer
-    note = "" if inside else f"\nnominal {off[0]:+.1f}, {off[1]:+.1f} sigma away"
+    note = "" if inside else f"\ndesign {off[0]:+.1f}, {off[1]:+.1f} sigma away"
     correlation = fit.covariance[at[0], at[1]] / (outer[0] * outer[1])
     axes.set(xlabel=SYMBOLS[pair[0]], ylabel=SYMBOLS[pair[1]])
     axes.set_title(f"correlation {correlation:+.3f}{note}", fontsize="medium")
