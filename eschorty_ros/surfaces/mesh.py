@@ -16,7 +16,7 @@ from eschorty_ros.core.base.files import folder_beside
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed
-from eschorty_ros.surfaces.plane import POINTS_MIN
+from eschorty_ros.surfaces.plane import POINTS_MIN, check_extent
 
 FORMATS = (".ply", ".obj", ".stl")
 _WITHIN = 0.95
@@ -79,6 +79,7 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0, progress: Progress | Non
     place = np.full(grid.point.size, -1, np.int64)
     place[used] = np.arange(len(used))
     measured = grid.xyz.reshape(-1, 3)[used], grid.sigma.ravel()[used]
+    check_extent(measured[0], "the cloud")
     shape = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(smooth.xyz.reshape(-1, 3)[used]),
         open3d.utility.Vector3iVector(place[triangles].astype(np.int32)),

@@ -206,11 +206,16 @@ def check_part(part: Part, name: str) -> None:
             f"{name} has {len(part.line):,} points in {lines} periods and {columns} columns; "
             f"choose a region with {POINTS_MIN} points or more in 3 of each"
         )
-    span_mm = np.ptp(part.xyz[:, 1:], axis=0)
+    check_extent(part.xyz, name)
+
+
+def check_extent(xyz: Array, name: str) -> None:
+    """Refuse points, (n, 3) in mm, of one line or one stage position with an ArgumentError."""
+    span_mm = np.ptp(xyz[:, 1:], axis=0)
     if span_mm.min() < _EXTENT_MIN_MM:
         raise ArgumentError(
             f"{name} extends {span_mm[0]:.3g} mm along y and {span_mm[1]:.3g} mm along z; "
-            "a plane needs an extent in both: give a sweep"
+            "a surface needs an extent in both: give a sweep"
         )
 
 

@@ -85,6 +85,9 @@ def test_what_cannot_be_meshed_has_one_line():
         mesh(points, 0.01)
     with pytest.raises(ArgumentError, match="on one surface"):
         mesh(points[points["column"] % 2 == 0])
+    points["y"] = 0.01
+    with pytest.raises(ArgumentError, match=r"0 mm along y .*give a sweep"):
+        mesh(points)
 
 
 @pytest.mark.parametrize("form", ["ply", "obj", "stl"])
