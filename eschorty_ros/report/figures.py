@@ -222,13 +222,17 @@ def image_of(
     return image
 
 
+def _rests(stage_mm: NDArray[np.float64]) -> bool:
+    return float(np.ptp(stage_mm)) < 1e-6
+
+
 def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the limits of a map's lines in rising order, one more than there are lines.
 
     Lines differ in height while the stage accelerates; with the stage at rest their height is 1.
     """
     at = np.sort(stage_mm)
-    if at[-1] - at[0] < 1e-6:
+    if _rests(stage_mm):
         return at[0] + np.linspace(-0.5, 0.5, at.size + 1)
     between = 0.5 * (at[1:] + at[:-1])
     return np.concatenate(([2 * at[0] - between[0]], between, [2 * at[-1] - between[-1]]))
@@ -267,6 +271,8 @@ def draw_map(
     )
     axes.set_facecolor("0.85")
     axes.set(xlabel=grid.along_label, ylabel="stage position (mm)")
+    if _rests(grid.stage_mm):
+        axes.set(ylabel=f"profiles, stage at {grid.stage_mm[0]:g} mm", yticks=[])
     width, height = np.ptp(grid.along_mm), np.ptp(edges_mm)
     if max(width, height) < LONG_MAP * min(width, height):
         axes.set_aspect("equal")

@@ -46,6 +46,14 @@ def test_scan_figure_has_every_part_with_units(tmp_path):
     assert (tmp_path / "scan.png").stat().st_size < 500_000
 
 
+def test_a_map_of_a_resting_stage_has_no_scale_of_positions():
+    points, error = step_cloud()
+    points["y"] = 0.012
+    labels = labels_of(figures.scan_figure(points, error))
+    assert "profiles, stage at 12 mm" in labels
+    assert "stage position (mm)" not in labels
+
+
 def thin_sheet(points):
     """The same cloud 3 mm deep: a short side beside two long ones."""
     flat = points.copy()
