@@ -53,7 +53,7 @@ def command(
 
     Each is registered against those before it by ICP with the points' own sigmas as weights.
     Printed are its rotation, its shift at the middle of the overlap, both with sigma, the distance
-    of its points from the others in sigmas (about 1 where they fit), and with --json the transform
+    of its points from the others in sigmas (0.5 to 1 where they fit), and with --json the transform
     in m and the covariance. --start turns about the sensor, not about the part, and then shifts:
     15 degrees move a part at 1.3 m by 340 mm.
 
@@ -96,13 +96,13 @@ def command(
             if pose.rms_sigmas < GOOD_SIGMAS:
                 warn(
                     f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.2f} sigma (RMS) from "
-                    "the clouds before, where about 1 is right; check that it is another scan, "
+                    "the clouds before, where 0.5 to 1 is right; check that it is another scan, "
                     "and that sigmas are not too large"
                 )
             if pose.rms_sigmas > POOR_SIGMAS:
                 warn(
                     f"{clouds[number + 1]}: its points are {pose.rms_sigmas:.1f} sigma (RMS) from "
-                    "the clouds before, where about 1 is right; check the picture, the start and "
+                    "the clouds before, where 0.5 to 1 is right; check the picture, the start and "
                     "that nothing moved"
                 )
             joined = join(joined, part, pose)
