@@ -209,8 +209,10 @@ def _add_lines(columns, half, place, blink):
             number += blink.lines.x != 0.0
             near += _cosine(vector, blink) > _NEAR
     lines = blink.lines
-    lines.x, lines.y = _KEPT * lines.x + x, _KEPT * lines.y + y
-    lines.number, lines.near = _KEPT * lines.number + number, _KEPT * lines.near + near
+    # A short line adds few of them: enough are kept.
+    kept = max(_KEPT, _LINES_MIN / max(lines.number, _LINES_MIN))
+    lines.x, lines.y = kept * lines.x + x, kept * lines.y + y
+    lines.number, lines.near = kept * lines.number + number, kept * lines.near + near
 
 
 @kernel(_nrt=True)

@@ -636,6 +636,19 @@ def test_a_lamp_beside_the_line_is_not_taken_for_it(lamp_hz, half_width_px):
     assert np.mean(np.abs(error_px(later)) > 10.0) < 0.02
 
 
+def test_a_lamp_beside_a_short_line_is_not_taken_for_it():
+    """A line of 255 columns shows the phase of its stream, too."""
+    camera = Camera(periods=60)
+    flicker = {"half_width_px": 15.0, "threshold": 0.5, "events_max": 9, "delay_us": 600.0}
+    lamp = Camera(frequency_hz=100.0, periods=86, seed=7, **flicker)
+    line = camera.line(lambda k, c: np.where(np.abs(c - 640) < 128, wavy(k, c), np.nan))
+    beside = lamp.line(lambda _, c: np.where(np.abs(c - 640) < 20, 520.0, np.nan))
+    found, _ = points(camera, line, beside)
+    later = found.select((found.period >= 8) & (np.abs(found.column - 640.0) < 20))
+    assert len(later) > 0.99 * 52 * 39, f"seed {camera.seed}"
+    assert np.mean(np.abs(error_px(later)) > 10.0) < 0.02
+
+
 @pytest.mark.parametrize("on_edge_us", [FIRST_EDGE_US, None])
 @pytest.mark.parametrize(("lamp_hz", "events"), [(100.0, 0.5), (100.0, 1.0), (120.0, 1.0)])
 def test_a_lamp_that_flickers_on_all_pixels_does_not_hide_the_line(lamp_hz, events, on_edge_us):
