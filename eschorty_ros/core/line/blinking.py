@@ -174,6 +174,13 @@ def _is_alike(vector, blink):
     return no_phase or _cosine(vector, blink) > _ALIKE
 
 
+@kernel
+def _has_direction(lines):
+    """Return whether the mean phase of recent lines is known: their vector strength is enough."""
+    least = _STRENGTH_MIN * lines.number
+    return lines.number >= _LINES_MIN and lines.x * lines.x + lines.y * lines.y > least * least
+
+
 @kernel(_nrt=False)
 def _is_of_the_stream(column, window, blink):
     """Return whether a window's events are in phase, with the laser and with other lines."""
@@ -245,6 +252,9 @@ def _laser_test(column, first, last, blink):
     if square > _STRENGTH_MIN**2:
         alike = _is_alike(vector, blink)
         follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
+        # In a known direction few events have this strength by chance about as rarely.
+        if not follows and _has_direction(blink.lines):
+            follows = np.sqrt(square) * _cosine(vector, blink) > _STRENGTH_MIN
         return _LaserTest(alike & follows, alike & (rayleigh > _RAYLEIGH_SURE))
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.

@@ -266,6 +266,19 @@ def test_few_events_are_no_flag_where_all_points_have_few(frequency_hz):
     assert np.mean(found.flags == 0) > 0.95, f"seed {camera.seed}"
 
 
+@pytest.mark.parametrize(("frequency_hz", "jitter_us"), [(300.0, 600.0), (1000.0, 150.0)])
+def test_few_events_that_come_late_give_points(frequency_hz, jitter_us):
+    camera = Camera(frequency_hz=frequency_hz, periods=40, jitter_us=jitter_us)
+    events = _kept(camera, 0.22)
+    t, column, row, _ = events
+    period = ((t - FIRST_EDGE_US) / camera.period_us).astype(int)
+    of_line = np.abs(row - wavy(period, column.astype(float))) < 12.0
+    number = np.bincount(period[of_line] * COLUMNS + column[of_line])
+    found, _ = points(camera, events)
+    assert len(found) > 0.98 * np.count_nonzero(number >= Settings().events_min)
+    assert np.mean(np.abs(error_px(found)) > 10.0) < 1e-3, f"seed {camera.seed}"
+
+
 @pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
 def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
     narrow = replace(CALIBRATION, columns=160, principal_column=None)
