@@ -30,8 +30,10 @@ from eschorty_ros.core.line.sigma import _own_variance
 from eschorty_ros.core.line.window import (
     AMBIGUOUS,
     FOUND,
+    FRACTION,
     ROW_BITS,
     ROW_LAST,
+    ROW_MASK,
     TOO_FEW,
     UNMODULATED,
     Sums,
@@ -110,10 +112,14 @@ class LineSums(NamedTuple):
 
 
 class PeriodSums(NamedTuple):
-    """Sums over the line of a period, and counts of columns."""
+    """Sums over the line of a period, and counts of columns.
+
+    Those with ``too_few_events`` are ``weak`` where two of these are at the line's row.
+    """
 
     line: LineSums
     too_few_events: np.int64
+    weak: np.int64
     ambiguous: np.int64
     two_returns: np.int64
     unmodulated: np.int64
@@ -309,6 +315,18 @@ def _pooled(out, estimator, counts):
     return LineSums((place + within) / _WIDTHS_PER_ROW, freedom, events, lines)
 
 
+@kernel
+def _are_two_near(packed, start, events, centre, half):
+    """Return whether two of a column's few events are within ``half`` of ``centre``.
+
+    One may be background.
+    """
+    near = 0
+    for i in range(start, start + events):
+        near += abs(np.int64(packed[i] & ROW_MASK) * FRACTION - centre) <= half
+    return near >= 2
+
+
 @entry_kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out``.
@@ -316,7 +334,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
     Events that do not follow the laser are left out, unless ``blink`` is no test.
     """
     out.events[:] = 0
-    few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0)
+    few, weak, ambiguous, two = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
@@ -333,6 +351,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0
+            seed = columns.seeds[c] if columns.seeds[c] >= 0 else neighbour
+            weak += seed >= 0 and _are_two_near(packed, columns.starts[c], n, seed, half)
             columns.second_rows[c], columns.events[c] = -1, 0
             continue
         column = _column(packed, columns.starts[c], n, blink.lit_us)
@@ -383,4 +403,4 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)
     line = _pooled(out, estimator, row_counts)
-    return PeriodSums(line, few, ambiguous, two, unmodulated, events_unmodulated)
+    return PeriodSums(line, few, weak, ambiguous, two, unmodulated, events_unmodulated)

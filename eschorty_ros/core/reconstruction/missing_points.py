@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED
-from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, periods_max
+from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, FEW_SHARE, periods_max
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.stream_faults import FEWER_EVENTS, is_unreadable
 from eschorty_ros.core.storage import Points
@@ -40,8 +40,12 @@ def missing_points(
     modulation: Modulation,
     columns: int,
     periods_per_profile: int,
+    faulty: bool,
 ) -> list[str]:
-    """Return one line for each reason; ``counts`` are the counters of a `Reconstructor`."""
+    """Return one line for each reason; ``counts`` are the counters of a `Reconstructor`.
+
+    Columns of a ``faulty`` stream, whose warnings come before, may have lost their events.
+    """
     removed = _gated(counts, settings, modulation) or _outside_region(counts)
     if removed := removed or _other_light(counts):
         return [removed]
@@ -52,7 +56,7 @@ def missing_points(
         _unmodulated(counts, modulation, columns),
         _cut(counts),
         _too_wide(counts, settings),
-        few,
+        few or ("" if faulty else _weak(counts, settings, modulation, periods_per_profile)),
         _long_profiles(settings, modulation, periods_per_profile),
     )
     return [reason for reason in reasons if reason]
@@ -68,10 +72,14 @@ def _gated(counts: Mapping[str, int], settings: Settings, modulation: Modulation
     )
 
 
+def _points_of_any_range(counts: Mapping[str, int]) -> int:
+    return sum(
+        counts[name] for name in ("points_found", "points_beyond_pole", "points_outside_roi")
+    )
+
+
 def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int) -> str:
-    unmodulated = counts["columns_unmodulated"]
-    found = ("points_found", "points_beyond_pole", "points_outside_roi")
-    points = sum(counts[name] for name in found)
+    unmodulated, points = counts["columns_unmodulated"], _points_of_any_range(counts)
     share = unmodulated / max(points + unmodulated, 1)
     # Background of dark columns, beside those of a line, has fewer events than these.
     line = counts["events_binned"] - counts["events_unmodulated"]
@@ -146,6 +154,26 @@ def _few_events(
     return (
         f"{few} columns have too few events for a point, {per_column:.2g} per column and profile "
         f"on average; set periods_per_profile to about {min(wanted, periods_max(modulation))}"
+    )
+
+
+def _weak(
+    counts: Mapping[str, int],
+    settings: Settings,
+    modulation: Modulation,
+    periods_per_profile: int,
+) -> str:
+    weak = counts["columns_weak"]
+    columns, most = _points_of_any_range(counts) + weak, periods_max(modulation)
+    if weak <= FEW_SHARE * columns:
+        return ""
+    events = max(counts["events_used"] / columns, 1.0)
+    wanted = max(math.ceil(periods_per_profile * EVENTS_WANTED / events), periods_per_profile + 1)
+    longer = f"set periods_per_profile to about {min(wanted, most)}, or "
+    return (
+        f"{weak} columns ({weak / columns:.0%} of those with events at the line's row) have fewer "
+        f"than events_min = {settings.events_min} and gave no points; "
+        f"{longer if periods_per_profile < most else ''}let the camera send more events"
     )
 
 

@@ -28,8 +28,8 @@ _SHORT_PERIODS_MIN = 16
 _CANDIDATES_MAX = 32
 _UNEVEN_ROWS = 1.5
 _BLOCK_EVENTS = 1 << 16
-# Part of the columns that may have few events.
-_FEW_SHARE = 1.0 / 24.0
+FEW_SHARE = 1.0 / 24.0
+"""Part of the columns that may have few events."""
 # Standard deviation of the events of even profiles over their mean, and their number to know it.
 _UNEVEN_SHARE = 0.2
 _PROFILES_MIN = 4
@@ -188,7 +188,7 @@ class ProfileLength:
         events = max(float(of_column @ weights), 1e-9)
         few = (seen & (counts < EVENTS_WANTED // 4)).sum(axis=0) @ weights
         wanted = 1
-        if events < enough or (few > _FEW_SHARE and not _are_even(in_period, 1)):
+        if events < enough or (few > FEW_SHARE and not _are_even(in_period, 1)):
             wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
         longer = range(wanted, len(counts) // _PROFILES_MIN + 1)
         even = [periods for periods in longer if wanted == 1 or _are_even(in_period, periods)]

@@ -119,6 +119,7 @@ COUNTERS = (
     "periods_empty",
     "profiles_too_wide",
     "columns_too_few_events",
+    "columns_weak",
     "columns_ambiguous",
     "columns_isolated",
     "columns_smoothed",
@@ -401,6 +402,7 @@ def _count(sums, counters):
     """Count a closed period and its columns."""
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
+    counters.columns_weak += sums.weak
     counters.columns_ambiguous += sums.ambiguous
     counters.columns_two_returns += sums.two_returns
     counters.columns_unmodulated += sums.unmodulated

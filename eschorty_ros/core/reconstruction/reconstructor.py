@@ -426,10 +426,11 @@ class Reconstructor:
                 f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
                 "of them is used"
             )
-        found += stream_faults(counts)
+        faults = stream_faults(counts)
+        found += faults
         if not is_unreadable(counts):
             stream = self.modulation, self.model.columns, self.periods_per_profile
-            found += missing_points(counts, self.settings, *stream)
+            found += missing_points(counts, self.settings, *stream, bool(faults))
         return found
 
     @property

@@ -279,6 +279,18 @@ def test_few_events_that_come_late_give_points(frequency_hz, jitter_us):
     assert np.mean(np.abs(error_px(found)) > 10.0) < 1e-3, f"seed {camera.seed}"
 
 
+@pytest.mark.parametrize("frequency_hz", [70.0, 5000.0])
+def test_columns_of_a_line_without_enough_events_have_a_reason_with_their_number(frequency_hz):
+    """Of 5 events on average 27 % of Poisson counts are below 4, and 4 % below 2."""
+    camera = Camera(frequency_hz=frequency_hz, periods=60)
+    found, reconstructor = points(camera, _kept(camera, 0.13), periods_per_profile=1)
+    assert 0.6 < len(found) / (camera.periods * COLUMNS) < 0.9, f"seed {camera.seed}"
+    (warning,) = reconstructor.warnings
+    number = int(warning.split()[0])
+    assert 0.75 < number / (camera.periods * COLUMNS - len(found)) <= 1.0
+    assert "fewer than events_min = 4 and gave no points" in warning
+
+
 @pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
 def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
     narrow = replace(CALIBRATION, columns=160, principal_column=None)
