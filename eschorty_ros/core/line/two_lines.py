@@ -19,6 +19,7 @@ _VARIANCE_MIN = 4.0
 # Two evenly lit lines with a gap of a third of their length have this share of their variance on
 # either side of the mean: 1 / (1 + 3 (4/3)^2). One evenly lit line has a quarter, a Gaussian more.
 _SIDES = 3.0 / 19.0
+_OFF, _ON = 1, 2
 # That of rows within a pixel.
 _PIXEL2 = 1.0 / 12.0
 
@@ -29,17 +30,18 @@ def empty_two_lines() -> NDArray[np.int64]:
 
 
 @kernel(_nrt=False)
-def _side_sums(packed, start, seed, half, on, parting):
-    """Return number, sum and sum of squares of rows up to ``parting`` and beyond, by polarity.
+def _side_sums(packed, start, seed, half, polarities, parting):
+    """Return number, sum and sum of squares of rows up to ``parting`` and beyond.
 
-    Rows are relative to the seed's.
+    Rows are relative to the seed's. Of ``polarities`` bit 0 takes OFF events and bit 1 ON ones.
     """
     middle = seed >> FRACTION_BITS
     low, high = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     i = np.uintp(start)
     while packed[i] != PAD:
         row = np.int64(packed[i] & ROW_MASK)
-        if abs((row << FRACTION_BITS) - seed) <= half and ((packed[i] & POLARITY) > 0) == on:
+        taken = polarities >> np.int64((packed[i] & POLARITY) > 0) & 1
+        if abs((row << FRACTION_BITS) - seed) <= half and taken:
             d = float(row - middle)
             if d <= parting:
                 low = low[0] + 1.0, low[1] + d, low[2] + d * d
@@ -56,29 +58,47 @@ def _scatter_of(sums):
 
 
 @kernel(_nrt=False)
-def _column_sides(packed, start, seed, half, unequal):
+def _are_apart(whole, sides):
+    """Return whether rows with these variances are of two lines."""
+    return whole > _VARIANCE_MIN and sides < _SIDES * whole
+
+
+@kernel(_nrt=False)
+def _column_sides(packed, start, seed, half, polarities, unequal):
     """Return the variance of a column's rows, and that on either side of a row that parts them.
 
     It is their mean. The mean of ``unequal`` lines is in the stronger one: these are parted in the
-    middle of both sides' means.
-
-    Events of one polarity count, the one with more: those of a line that moves while it is lit are
-    apart. Zeros where there are too few.
+    middle of both sides' means. Zeros where there are too few events.
     """
-    on, _ = _side_sums(packed, start, seed, half, True, np.inf)
-    off, _ = _side_sums(packed, start, seed, half, False, np.inf)
-    more = on if on[0] >= off[0] else off
-    if more[0] < _EVENTS_MIN:
+    every, _ = _side_sums(packed, start, seed, half, polarities, np.inf)
+    if every[0] < _EVENTS_MIN:
         return 0.0, 0.0
-    low = high = more
-    parting, before = more[1] / more[0], np.inf
+    low = high = every
+    parting, before = every[1] / every[0], np.inf
     while parting != before and high[0] > 0.0:
-        low, high = _side_sums(packed, start, seed, half, on[0] >= off[0], parting)
+        low, high = _side_sums(packed, start, seed, half, polarities, parting)
         middle = 0.5 * (low[1] / low[0] + high[1] / max(high[0], 1.0))
         before = parting
         parting = middle if unequal else parting
     sides = _scatter_of(low) + _scatter_of(high)
-    return _scatter_of(more) / more[0] + _PIXEL2, sides / more[0] + _PIXEL2
+    return _scatter_of(every) / every[0] + _PIXEL2, sides / every[0] + _PIXEL2
+
+
+@kernel(_nrt=False)
+def _two_sides(packed, start, seed, half, unequal):
+    """Return what `_column_sides` does of the polarity with more events, and whether it has two.
+
+    ON and OFF events of a line that moves while it is lit are apart. Those of one polarity may miss
+    in the middle of a line whose pixels give the other one there: both together show no gap then.
+    """
+    on, _ = _side_sums(packed, start, seed, half, _ON, np.inf)
+    off, _ = _side_sums(packed, start, seed, half, _OFF, np.inf)
+    more = _ON if on[0] >= off[0] else _OFF
+    whole, sides = _column_sides(packed, start, seed, half, more, unequal)
+    has_two = _are_apart(whole, sides)
+    if has_two:
+        has_two = _are_apart(*_column_sides(packed, start, seed, half, _ON | _OFF, unequal))
+    return whole, sides, has_two
 
 
 @kernel(_nrt=False)
@@ -94,13 +114,12 @@ def _single_half(columns, half, successive, profiles):
     apart = max(columns.seeds.size // successive.size, 1)
     for k in range(np.uintp(min(successive.size, columns.seeds.size))):
         c = k * np.uintp(apart)
-        whole, sides = 0.0, 0.0
+        whole, sides, has_two = 0.0, 0.0, False
         if columns.seeds[c] >= 0:
-            whole, sides = _column_sides(
+            whole, sides, has_two = _two_sides(
                 columns.packed, columns.starts[c], columns.seeds[c], half, successive[k] == profiles
             )
         lines += whole > 0.0
-        has_two = whole > _VARIANCE_MIN and sides < _SIDES * whole
         successive[k] = successive[k] + 1 if has_two else 0
         if successive[k] >= PROFILES_WITH_TWO:
             two += 1

@@ -10,7 +10,7 @@ from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime import rtsys
 from reconstructing import CALIBRATION, reconstruct
 
-from eschorty_ros.core.evt3 import Decoder, Encoder
+from eschorty_ros.core.evt3 import Decoder, Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import (
     Profiles,
@@ -215,6 +215,21 @@ def test_a_reflection_near_the_line_is_not_averaged_with_it(apart_px, power, pix
     assert separate.sum() > 0.99 * 17 * 1280, f"seed {camera.seed}"
     assert np.mean(np.abs(error_px(found)[separate]) > 1.0) < 0.001
     assert np.all(found.flags[found.period == 2] & MIXED)
+
+
+def test_pixels_that_give_one_polarity_each_are_one_line():
+    """ON events at its ends alone, OFF events in its middle, as where pixels follow every other."""
+    events = []
+    for edge, rows in ((0, [*range(-10, -5), *range(6, 11)]), (500, range(-4, 5))):
+        period, column, row = np.meshgrid(range(40), range(300), rows, indexing="ij")
+        t_us = FIRST_EDGE_US + 1000 * period + edge + 100 + abs(row)
+        polarity = np.full(period.shape, edge == 0, np.uint8)
+        events.append(tuple(v.ravel() for v in (t_us, column, 350 + row, polarity)))
+    merged = sort_readout(*map(np.concatenate, zip(*events, strict=True)))
+    known = Modulation(1000.0, on_edge_us=FIRST_EDGE_US)
+    found, _ = reconstruct(Encoder().encode(*merged), known)
+    assert len(found) == 40 * 300
+    assert np.abs(found.row - 350.0).max() < 0.5
 
 
 def test_a_reflection_beside_the_line_does_not_pull_learned_rows():
