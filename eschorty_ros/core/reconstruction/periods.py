@@ -42,6 +42,11 @@ class PeriodCutter:
         self.recorder: EdgeRecorder | None = None
 
     @property
+    def fills_columns(self) -> bool:
+        """Return whether light that follows the laser comes from many rows of a column."""
+        return self._length.fills_columns
+
+    @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
         return {

@@ -13,7 +13,11 @@ from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.line.blinking import PERIOD_MIN_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents, sample
-from eschorty_ros.core.modulation.phase_estimate import estimation_window, line_phase
+from eschorty_ros.core.modulation.phase_estimate import (
+    estimate_phase,
+    estimation_window,
+    line_phase,
+)
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
 _PERIODS_MAX = 1000
@@ -40,6 +44,8 @@ _SAMPLE = 1 << 16
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
 _CELL_BITS = 4
 _LINE_CELLS_MAX = 8.0
+# Vector strength of events of which most follow the laser, as for those of a column.
+_FOLLOW_STRENGTH = 0.5
 
 
 def periods_max(modulation: Modulation) -> int:
@@ -63,6 +69,11 @@ class ProfileLength:
     is not enough in the first block, with twice as many events, the next one counts, since pixels
     give more when the laser is switched on. Blocks without light do not count. A block has
     `BLOCK_US`, but two periods at least; the first one ends with enough events after four.
+
+    Public attributes:
+    - ``window``: First and last of the held events that showed the laser, ``None`` before.
+    - ``fills_columns``: True where most of these, or of the first, follow the laser and are on no
+      line.
     """
 
     def __init__(self, modulation: Modulation) -> None:
@@ -70,6 +81,7 @@ class ProfileLength:
         self._span_us = max(BLOCK_US, round(_BLOCK_PERIODS * modulation.period_us))
         self._seen = 0
         self.window: tuple[int, int] | None = None
+        self.fills_columns = False
 
     def choose(self, held: HeldEvents, watermark_us: int, last: bool = False) -> int:
         """Return the periods of a profile, 0 while the held events do not give them.
@@ -95,7 +107,10 @@ class ProfileLength:
             if window is None and not last:
                 return 0
             self._seen = end = t.size if window is None else begin + window.size
-            if self._edge_us(held, begin, end) is not None:
+            found = self._edge_us(held, begin, end) is not None
+            if found or begin == 0:
+                self.fills_columns = self._is_everywhere(held, begin, end)
+            if found:
                 self.window = begin, end
             elif window is None:
                 return 1
@@ -160,6 +175,13 @@ class ProfileLength:
         events = sample([values[begin:end] for values in held.arrays], _SAMPLE)
         phase = line_phase(events, self._modulation)
         return phase.edge_us if phase.found or _is_line(*events[1:3]) else None
+
+    def _is_everywhere(self, held: HeldEvents, begin: int, end: int) -> bool:
+        """Return whether events of a window follow the laser and are in many rows of a column."""
+        t_us, columns, rows, polarity = (values[begin:end] for values in held.arrays)
+        if begin == end or _is_line(columns, rows):
+            return False
+        return estimate_phase(t_us, polarity, self._modulation).strength > _FOLLOW_STRENGTH
 
     def _periods(
         self, turns: Array, columns: NDArray[np.uint16], rows: NDArray[np.uint16], enough: int

@@ -421,7 +421,12 @@ class Reconstructor:
         """Return the warnings about the stream since its counters were ``before``."""
         found: list[str] = []
         counts = {name: count - before.get(name, 0) for name, count in self.counters.items()}
-        if self.phase_missing:
+        if self._periods.fills_columns:
+            found.append(
+                "light that follows the laser comes from many rows of a column, and that of a line "
+                "from few; turn the camera so that the line crosses all columns, or focus the laser"
+            )
+        elif self.phase_missing:
             found.append(
                 f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
                 "of them is used"

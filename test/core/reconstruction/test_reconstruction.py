@@ -69,6 +69,14 @@ def test_background_alone_gives_practically_no_points():
     assert false <= 1e-4 * 60 * 1280, f"seed {SEED}: {false}"
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_camera_turned_by_a_quarter_has_a_warning(turned):
+    t_us, column, row, polarity = lines(columns=720, periods=8)
+    pixels = (row, column) if turned else (column, row)
+    _, found = reconstruct(encoded(sort_readout(t_us, *pixels, polarity)), Modulation(70.0))
+    assert any("turn the camera" in line for line in found.warnings) == turned, f"seed {SEED}"
+
+
 def _split_cases():
     rng = np.random.default_rng(SEED)
     events = line_events(rng, flat, frequency_hz=500.0, periods=40, columns=300, edge_us=5000)
