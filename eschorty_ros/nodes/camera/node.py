@@ -41,7 +41,7 @@ LATE_S = 0.1
 _LOSSES = ("drops", "gaps", "sensor_drop_words", "erc_events_dropped")
 
 TABLE = (
-    *drivers.DRIVER,
+    *drivers.table("camera"),
     *EVK4_TABLE,
     FRAME_PREFIX,
     Param(
@@ -99,7 +99,6 @@ class CameraNode(DeviceNode):
     def open_device(self) -> None:
         """Open the camera."""
         self._source = drivers.make(
-            "camera",
             make_camera,
             lambda bench: {"backend": usb_spec(bench)},
             self.parameters,

@@ -44,7 +44,7 @@ _REFUSAL_LOG_S = 5.0
 WATCHED = ("camera", "stage")
 
 TABLE = (
-    *drivers.DRIVER,
+    *drivers.table("laser"),
     Param(
         "frequency",
         70.0,
@@ -138,7 +138,6 @@ class LaserNode(DeviceNode):
     def open_device(self) -> None:
         """Open the generator, off, with the modulation of the parameters."""
         laser = drivers.make(
-            "laser",
             _make_laser,
             lambda bench: {"backend": usb_spec(bench)},
             self.parameters,

@@ -37,7 +37,7 @@ _ODOM_DEPTH = 2000
 _INTERRUPTED = "move interrupted by shutdown"
 
 TABLE = (
-    *drivers.DRIVER,
+    *drivers.table("stage"),
     *DRIVER_TABLE,
     Param("odom_rate", 100.0, "rate of stage/odom in motion; 5 Hz at rest", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
@@ -88,7 +88,6 @@ class StageNode(DeviceNode):
     def open_device(self) -> None:
         """Open the stage."""
         stage = drivers.make(
-            "stage",
             make_stage,
             lambda bench: {"port": stage_port(bench)},
             self.parameters,

@@ -63,6 +63,10 @@ def test_the_file_to_copy_holds_the_defaults():
             ros_file(laser={"hihg_v": 5.0}),
             ("'hihg_v' is no parameter of /eschorty/laser", "did you mean high_v?"),
         ),
+        (
+            ros_file(stage={"driver": "atp"}),
+            ("/eschorty/stage: driver is 'atp'; choose one of fake, apt",),
+        ),
         ("/eschorty/laser: 5", ("/eschorty/laser is 5", "write parameters under ros__parameters")),
         ("/eschorty/laser: {high_v: 5.0}", ("write parameters under ros__parameters",)),
         ("[1]", ("it holds [1]",)),
