@@ -17,8 +17,11 @@ from click.testing import CliRunner
 from grid_clouds import cloud, moved
 
 from eschorty_ros.cli import COMMANDS, main
+from eschorty_ros.core.line import CENTROIDS
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import write_cloud
+from eschorty_ros.simulation.pixels import PRESETS
+from eschorty_ros.simulation.scenes import NAMES
 from eschorty_ros.surfaces.register import pose_matrix
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -233,6 +236,15 @@ def test_paths_in_the_documents_exist():
             r"`((?:eschorty_ros|test|docs|config)/[\w/]+(?:\.\w+|/))`", document.read_text()
         ):
             assert (ROOT / path).exists(), f"{document.name} names {path}"
+
+
+@pytest.mark.parametrize(
+    ("page", "names"), [("tutorial", NAMES), ("glossary", CENTROIDS), ("ros", PRESETS)]
+)
+def test_lists_are_complete(page, names):
+    text = (ROOT / "docs" / f"{page}.md").read_text()
+    missing = [name for name in names if f"`{name}`" not in text]
+    assert not missing, f"docs/{page}.md does not name {', '.join(missing)}"
 
 
 def test_the_architecture_names_files_and_functions_that_exist():
