@@ -159,7 +159,7 @@ class RenewedLaser(LaserModulator, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StageState:
-    """One reading of the stage."""
+    """State of the stage at ``t_ns`` of the clock that its driver is given."""
 
     position_mm: float
     velocity_mm_s: float
@@ -170,7 +170,7 @@ class StageState:
 
 
 class LinearStage(Protocol):
-    """A linear stage with absolute moves that end by themselves."""
+    """A linear stage with absolute moves that end by themselves; thread-safe."""
 
     identity: DeviceIdentity
     trigger: PulseTrain | None
@@ -187,19 +187,25 @@ class LinearStage(Protocol):
         """Start homing; ``state().homed`` is true at its end."""
 
     def move_to(self, position_mm: float, speed_mm_s: float) -> None:
-        """Start an absolute move; raises ``DeviceError`` outside travel, too fast or not homed."""
+        """Start an absolute move; ``state().moving`` is true from now on until it has ended.
+
+        Raises ``DeviceError`` outside travel, too fast or not homed.
+        """
 
     def stop(self) -> None:
         """Begin a profiled stop; idempotent."""
 
     def state(self, t_ns: int | None = None) -> StageState:
-        """Return position, velocity, time and flags, by default at the newest time known.
+        """Return the state at an earlier time, interpolated, by default at the newest time known.
 
         Raises ``DeviceError`` when the stage has failed.
         """
 
     def statistics(self) -> dict[str, float]:
-        """Return counters for diagnostics, by name with unit."""
+        """Return counters for diagnostics, by name with unit.
+
+        More ``command_errors`` than before are a warning.
+        """
 
     def close(self) -> None:
         """Stop and release; idempotent."""
