@@ -35,10 +35,13 @@ def test_event_packet_is_the_public_one() -> None:
 def test_every_interface_of_the_source_is_built() -> None:
     share = _share("eschorty_ros")
     for kind in ("msg", "srv", "action"):
-        sources = {path.stem for path in (ROOT / kind).glob(f"*.{kind}")}
+        sources, built = (
+            {path.name: path.read_text() for path in (folder / kind).glob(f"*.{kind}")}
+            for folder in (ROOT, share)
+        )
         assert sources
-        built = {path.stem for path in (share / kind).glob(f"*.{kind}")}
-        assert sources == built, "run: make setup"
+        changed = [name for name in sources | built if sources.get(name) != built.get(name)]
+        assert not changed, f"{', '.join(changed)}: not built as in the sources; run: make setup"
 
 
 def test_installed_layout() -> None:
