@@ -46,7 +46,7 @@ class CommandParser:
             yield layout.name, body[4] & ~apt.LONG, dict(zip(layout.fields, fields, strict=False))
 
 
-def pack_answer(name: str, source: int, *, reserved_bytes: int = 0, **values: int | bytes) -> bytes:
+def pack_answer(name: str, source: int, *, reserved_bytes: int, **values: int | bytes) -> bytes:
     """Return the frame of the message ``name`` to the host; fields not given are 0.
 
     - ``reserved_bytes``: Zeros at its end, where the message may be longer than its fields.

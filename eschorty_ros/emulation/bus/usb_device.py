@@ -33,7 +33,7 @@ class EndpointIdentity:
     """A bulk endpoint: address (bit 7 set = to the host) and packet size in bytes."""
 
     address: int
-    max_packet: int = 512
+    max_packet: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +46,9 @@ class UsbIdentity:
     interface_subclass: int
     interface_protocol: int
     endpoints: tuple[EndpointIdentity, ...]
-    serial: str = ""
-    manufacturer: str = ""
-    product: str = ""
+    serial: str
+    manufacturer: str
+    product: str
     bcd_device: int = 0x0100
     speed: int = SPEED_HIGH
 

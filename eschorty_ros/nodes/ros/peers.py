@@ -107,7 +107,7 @@ class LatchedState:
         topic: str,
         take: Callable[[Any], None],
         ended: Callable[[], None],
-        group: CallbackGroup | None = None,
+        group: CallbackGroup,
     ) -> None:
         self._node, self._kind, self._topic, self._group = node, kind, topic, group
         self._take, self._ended = take, ended
