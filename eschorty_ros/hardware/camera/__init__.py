@@ -8,14 +8,13 @@ from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
 from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_US
 from eschorty_ros.hardware.camera.pixel_selection import Window, windows_of
-from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
+from eschorty_ros.hardware.camera.settings import CameraSettings
 
 __all__ = [
     "ANTI_FLICKER_HZ",
     "BIASES",
     "ERC_RATE_MAX",
     "HEIGHT",
-    "LEAVE",
     "PACKET_PERIOD_US",
     "TRAIL_THRESHOLD_US",
     "TRAIL_TYPES",

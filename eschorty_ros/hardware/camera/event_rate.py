@@ -12,7 +12,6 @@ from eschorty_ros.hardware.camera.registers import Registers, Write, run_sequenc
 PERIOD_US = 200
 COUNT_MAX = 640_000
 ERC_RATE_MAX = COUNT_MAX * 1_000_000 // PERIOD_US
-ERC_RATE_DEFAULT = 20_000_000
 
 _CONTROL, _TARGET, _SWITCH, _COUNT = 0x6000, 0x602C, 0x6050, 0x600C
 _COUNT_MASK = 0x3F_FFFF
@@ -21,7 +20,7 @@ _BEFORE_TABLES = (
     Write(_CONTROL, 0, 0x3),
     Write(0x6004, 1, 0x1),
     Write(0x6008, PERIOD_US, 0x3FF),
-    Write(_COUNT, ERC_RATE_DEFAULT * PERIOD_US // 1_000_000, _COUNT_MASK),
+    Write(_COUNT, 20_000_000 * PERIOD_US // 1_000_000, _COUNT_MASK),
     Write(0x6028, 0x3, 0x7),
     Write(_TARGET, 1, 0x1),
 )
@@ -44,16 +43,19 @@ def initialise(registers: Registers) -> None:
     run_sequence(registers, INITIALISE, lambda _s: None)
 
 
-def set_event_rate(registers: Registers, enabled: bool, rate: int) -> int:
-    """Switch the control and set its limit (events/s); returns the limit read back.
+def set_event_rate(registers: Registers, rate: int | None) -> int:
+    """Set the limit (events/s), ``None`` to switch the control off; return it as read back, or 0.
 
     Raises ``ArgumentError`` for a rate outside 5000 to 3.2e9 events/s.
     """
+    if rate is None:
+        update(registers, _SWITCH, 1, 0)
+        return 0
     count = rate * PERIOD_US // 1_000_000
     if not 1 <= count <= COUNT_MAX:
         raise ArgumentError(
             f"erc_rate is {rate} events/s; choose {1_000_000 // PERIOD_US} to {ERC_RATE_MAX}"
         )
-    update(registers, _SWITCH, 1, int(enabled))
+    update(registers, _SWITCH, 1, 1)
     update(registers, _COUNT, _COUNT_MASK, count)
     return (registers.read(_COUNT) & _COUNT_MASK) * 1_000_000 // PERIOD_US

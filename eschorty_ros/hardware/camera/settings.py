@@ -7,16 +7,11 @@ from dataclasses import dataclass, field
 
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
 from eschorty_ros.hardware.camera.biases import BiasBank, check_offset
-from eschorty_ros.hardware.camera.event_rate import ERC_RATE_DEFAULT, set_event_rate
+from eschorty_ros.hardware.camera.event_rate import set_event_rate
 from eschorty_ros.hardware.camera.event_trail import clear_event_trail, set_event_trail
-from eschorty_ros.hardware.camera.monitors import (
-    set_packet_period,
-    set_trigger_input,
-)
+from eschorty_ros.hardware.camera.monitors import set_packet_period, set_trigger_input
 from eschorty_ros.hardware.camera.pixel_selection import Window, set_hot_pixels, set_windows
 from eschorty_ros.hardware.camera.registers import Registers
-
-LEAVE = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +22,8 @@ class CameraSettings:
     """Offsets from the factory trim; biases not named keep it."""
     wide_biases: bool = False
     """Allow the wide ranges."""
-    packet_period_us: int = LEAVE
-    """Period of the sensor's packets, the latency of the stream; -1 leaves 4000 us."""
+    packet_period_us: int | None = None
+    """Period of the sensor's packets, the latency of the stream; ``None`` leaves 4000 us."""
     erc_rate: int | None = None
     """Events/s beyond which the sensor drops some; ``None`` switches the control off."""
     anti_flicker: AntiFlicker | None = None
@@ -57,11 +52,9 @@ def apply_settings(
     for name, offset in settings.biases.items():
         biases.write(name, offset)
     applied: dict[str, float] = dict(biases.read())
-    if settings.packet_period_us != LEAVE:
+    if settings.packet_period_us is not None:
         applied["packet_period_us"] = set_packet_period(registers, settings.packet_period_us)
-    enabled = settings.erc_rate is not None
-    rate = set_event_rate(registers, enabled, settings.erc_rate or ERC_RATE_DEFAULT)
-    applied["erc_rate_hz"] = rate if enabled else 0
+    applied["erc_rate_hz"] = set_event_rate(registers, settings.erc_rate)
     set_anti_flicker(registers, settings.anti_flicker)
     if settings.trail_filter:
         applied["trail_threshold_us"] = set_event_trail(

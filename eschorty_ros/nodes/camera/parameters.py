@@ -14,7 +14,6 @@ from eschorty_ros.hardware.camera import (
     BIASES,
     ERC_RATE_MAX,
     HEIGHT,
-    LEAVE,
     PACKET_PERIOD_US,
     TRAIL_THRESHOLD_US,
     TRAIL_TYPES,
@@ -30,6 +29,7 @@ from eschorty_ros.nodes.ros.drivers import ClockNs
 from eschorty_ros.nodes.ros.parameters import Param
 
 _IGNORED = "; the emulated camera ignores it"
+_LEAVE = -1
 _FULL_FRAME = (0, 0, WIDTH, HEIGHT)
 
 _BIAS_TABLE = tuple(
@@ -60,10 +60,10 @@ EVK4_TABLE = (
     *_BIAS_TABLE,
     Param(
         "mipi_frame_period",
-        LEAVE,
+        _LEAVE,
         "period of the sensor's packets (latency), in steps of 16; -1 leaves 4000",
         "us",
-        LEAVE,
+        _LEAVE,
         PACKET_PERIOD_US[1],
     ),
     Param(
@@ -113,11 +113,11 @@ def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
     Raises ``ArgumentError`` for a value outside its range. Raises ``FormatError`` for a malformed
     bias file.
     """
-    enabled = parameters["erc_mode"] == "enabled"
+    enabled, period_us = parameters["erc_mode"] == "enabled", parameters["mipi_frame_period"]
     return CameraSettings(
         biases=_biases(parameters),
         wide_biases=parameters["bias_range"] == "wide",
-        packet_period_us=parameters["mipi_frame_period"],
+        packet_period_us=None if period_us == _LEAVE else period_us,
         erc_rate=parameters["erc_rate"] if enabled else None,
         anti_flicker=_anti_flicker(parameters),
         trail_filter=parameters["trail_filter_type"] if parameters["trail_filter"] else "",

@@ -126,9 +126,9 @@ def test_limited_and_free_cameras_make_the_same_events(tmp_path: Path) -> None:
     assert made[0] == made[1]
 
 
-@pytest.mark.parametrize(("set_us", "packet_us"), [(-1, 4000), (2000, 2000)])
+@pytest.mark.parametrize(("set_us", "packet_us"), [(None, 4000), (2000, 2000)])
 def test_packets_of_the_bench_last_as_the_camera_is_set(
-    tmp_path: Path, set_us: int, packet_us: int
+    tmp_path: Path, set_us: int | None, packet_us: int
 ) -> None:
     with CameraOnBench(tmp_path, CameraSettings(packet_period_us=set_us)) as setup:
         assert setup.bench.physics.packet_us == packet_us

@@ -98,11 +98,14 @@ def test_event_rate_tables_and_limit() -> None:
     assert registers.values[0x6400 + 4 * 255] == 511 << 16 | 510
     assert all(registers.values[0x6800 + 4 * i] == 0x0808_0808 for i in range(230))
     assert registers.values[0x6050] == 0
-    assert event_rate.set_event_rate(registers, True, 100_000_000) == 100_000_000
+    assert event_rate.set_event_rate(registers, 100_000_000) == 100_000_000
     assert registers.values[0x6050] == 1
     assert registers.values[0x600C] == 20_000
-    with pytest.raises(ArgumentError, match="erc_rate is 3300000000"):
-        event_rate.set_event_rate(registers, True, 3_300_000_000)
+    for rate in (0, 3_300_000_000):
+        with pytest.raises(ArgumentError, match=f"erc_rate is {rate} "):
+            event_rate.set_event_rate(registers, rate)
+    assert event_rate.set_event_rate(registers, None) == 0
+    assert registers.values[0x6050] == 0
 
 
 def test_anti_flicker_band(registers: RegisterFile) -> None:
