@@ -168,7 +168,8 @@ class InstrumentMonitor:
         """Raise ``ScanFailure`` when a move that began then has ended without a result."""
         if _age_s(max(begun_s, self._moved_s)) > _MOTION_S:
             raise ScanFailure(
-                f"stage: it rests at {self.position_mm * 1e-3:g} m, but its move does not end"
+                f"stage: it rests at {self.position_mm * 1e-3:g} m, but its move does not end; "
+                "look at the log of its node"
             )
 
     def check_clocks(self) -> None:
@@ -188,7 +189,7 @@ class InstrumentMonitor:
         """Raise ``ScanFailure`` when the reconstruction made no progress for ``timeout_s``."""
         if _age_s(self._advanced_s) > timeout_s:
             cause, _, remedy = self.cause_of_no_progress().partition("; ")
-            raise ScanFailure(f"{cause} for {timeout_s:g} s" + (f"; {remedy}" if remedy else ""))
+            raise ScanFailure(f"{cause} for {timeout_s:g} s; {remedy or 'check that it runs'}")
 
     def check_laser(self) -> None:
         """Raise ``ScanFailure`` when the laser does not report or is not on."""

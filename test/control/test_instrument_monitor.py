@@ -60,6 +60,12 @@ def test_the_end_of_the_reconstruction_is_found_by_its_process():
         subject.check_reconstruction()
 
 
+def test_without_progress_the_component_that_lacks_is_named_with_a_remedy():
+    lacks = "reconstruction: it does not report for 3 s; check that it runs"
+    with pytest.raises(ScanFailure, match=lacks):
+        InstrumentMonitor(lambda: True).check_progress(3.0)
+
+
 def test_a_drain_ends_although_there_is_progress():
     subject = monitor()
     waiting = PacedWaiting("scanner", subject, lambda: 10**18, lambda: True, 3.0)

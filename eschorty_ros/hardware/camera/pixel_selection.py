@@ -68,7 +68,7 @@ def set_hot_pixels(registers: Registers, pixels: Sequence[tuple[int, int]]) -> N
     for x, y in pixels:
         if not (0 <= x < WIDTH and 0 <= y < HEIGHT):
             raise ArgumentError(
-                f"hot pixel {x}, {y} is outside the sensor of {WIDTH} x {HEIGHT} pixels"
+                f"hot_pixels has {x},{y}; the sensor has {WIDTH} columns and {HEIGHT} rows"
             )
     words = [_VALID | y << 16 | x for x, y in pixels]
     for index in range(HOT_PIXELS_MAX):

@@ -144,7 +144,11 @@ class UsbTmc:
         with translated(f"{self._name}: {what}"):
             sent = self._device.write(self._out.bEndpointAddress, data, self._timeout_ms)
         if sent != len(data):
-            raise DeviceError(f"{self._name}: {what}: {sent} of {len(data)} bytes went out")
+            raise self._broken(f"{what}: {sent} of {len(data)} bytes went out")
+
+    def _broken(self, what: str) -> DeviceError:
+        """Return the error of a transfer that came through, but not as it should be."""
+        return DeviceError(f"{self._name}: {what}; check cable and hub")
 
     def _receive(self, size: int) -> bytes:
         with translated(f"{self._name}: reading a reply"):
@@ -165,23 +169,21 @@ class UsbTmc:
         if missing > 0 and len(data) == self._packet:
             data += self._receive(-(-missing // self._packet) * self._packet)
         if len(data) < _HEADER.size + size:
-            raise DeviceError(
-                f"{self._name}: a reply announced {size} bytes and brought "
-                f"{len(data) - _HEADER.size}"
-            )
+            brought = len(data) - _HEADER.size
+            raise self._broken(f"a reply announced {size} bytes and brought {brought}")
         return data[_HEADER.size : _HEADER.size + size], ended
 
     def _checked(self, data: bytes) -> tuple[int, bool]:
         """Return size and end mark of a reply header; refuses one for another request."""
         if len(data) < _HEADER.size:
-            raise DeviceError(f"{self._name}: a reply of {len(data)} bytes is too short")
+            raise self._broken(f"a reply of {len(data)} bytes is too short")
         kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
         if (kind, tag, inverse) != (_REPLY_IN, self._tag, self._tag ^ 0xFF):
             wrong = "tag" if kind == _REPLY_IN else f"message id, {kind},"
-            raise DeviceError(f"{self._name}: a reply header has the wrong {wrong} for its request")
+            raise self._broken(f"a reply header has the wrong {wrong} for its request")
         if size > _REQUEST_MAX_BYTES:
-            raise DeviceError(
-                f"{self._name}: a reply announced {size} bytes, {_REQUEST_MAX_BYTES} were requested"
+            raise self._broken(
+                f"a reply announced {size} bytes, {_REQUEST_MAX_BYTES} were requested"
             )
         return size, bool(attributes & _END_OF_MESSAGE)
 
@@ -206,7 +208,7 @@ class UsbTmc:
                 _CLASS_INTERFACE_IN, request, 0, self._interface, size, self._timeout_ms
             )
         if len(answer) < size:
-            raise DeviceError(f"{self._name}: clearing was answered with {len(answer)} bytes")
+            raise self._broken(f"clearing was answered with {len(answer)} bytes")
         return bytes(answer)
 
     def _clear_halts(self) -> None:

@@ -149,7 +149,9 @@ class CameraNode(DeviceNode):
             if thread is not None:
                 thread.join(STOP_TIMEOUT_S)
         if thread is not None and thread.is_alive():
-            raise DeviceError(f"the camera does not stop within {STOP_TIMEOUT_S:g} s")
+            raise DeviceError(
+                f"the camera does not stop within {STOP_TIMEOUT_S:g} s; configure it again"
+            )
 
     def close_device(self) -> None:
         """Release the camera."""

@@ -197,7 +197,7 @@ def test_hot_pixels(registers: RegisterFile) -> None:
     assert registers.values[0x91FC] == 0
     with pytest.raises(ArgumentError, match="names 65 pixels"):
         set_hot_pixels(registers, [(0, 0)] * 65)
-    with pytest.raises(ArgumentError, match="hot pixel 0, 720"):
+    with pytest.raises(ArgumentError, match="hot_pixels has 0,720; the sensor has 1280 columns"):
         set_hot_pixels(registers, [(0, 720)])
 
 

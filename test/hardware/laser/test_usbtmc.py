@@ -100,9 +100,9 @@ def test_endless_reply_is_refused(link: UsbTmc, model: Echo) -> None:
 @pytest.mark.parametrize(
     ("fault", "kind", "text"),
     [
-        ("wrong_tags", DeviceError, "wrong tag for its request"),
+        ("wrong_tags", DeviceError, "wrong tag for its request; check cable and hub"),
         ("wrong_kinds", DeviceError, "wrong message id, 3,"),
-        ("short_headers", DeviceError, "too short"),
+        ("short_headers", DeviceError, "too short; check cable and hub"),
         ("oversized", DeviceError, "announced 101 bytes and brought 1"),
         ("lost_replies", DeviceTimeoutError, "ETIMEDOUT"),
     ],
