@@ -11,11 +11,7 @@ from typing import Any, NoReturn
 import usb.core
 
 from eschorty_ros.emulation.bus.usb_descriptors import DescriptorBackend
-from eschorty_ros.emulation.bus.usb_device import (
-    DIRECTION_IN,
-    EmulatedUsbDevice,
-    UsbFault,
-)
+from eschorty_ros.emulation.bus.usb_device import DIRECTION_IN, EmulatedUsbDevice, UsbFault
 
 Buffer = array.array | bytearray | memoryview
 

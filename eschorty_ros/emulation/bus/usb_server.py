@@ -24,13 +24,7 @@ import usb.core
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend, Handle
 from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice
-from eschorty_ros.emulation.bus.usb_wire import (
-    NUMBERS,
-    Closed,
-    Op,
-    receive_request,
-    send_answer,
-)
+from eschorty_ros.emulation.bus.usb_wire import NUMBERS, Closed, Op, receive_request, send_answer
 
 
 class UsbServer:

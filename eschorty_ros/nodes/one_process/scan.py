@@ -15,12 +15,7 @@ from eschorty_ros.control.scan_sequence import ScanRequest, check_request
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, finite_points
 from eschorty_ros.emulation.bench.process import START_S
-from eschorty_ros.nodes.one_process.composition import (
-    Tables,
-    bench_parameters,
-    composition,
-    wait,
-)
+from eschorty_ros.nodes.one_process.composition import Tables, bench_parameters, composition, wait
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, stage_limits

@@ -43,11 +43,7 @@ from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.msg import StageLimits as StageLimitsMessage
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
-from eschorty_ros.nodes.ros.conversions import (
-    m_from_mm,
-    mm_from_m,
-    stage_position_mm,
-)
+from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stage_position_mm
 from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.peers import OnePublisher, age_s
