@@ -30,6 +30,7 @@ class CalibrationJob:
     as_built: str
     """The build as designed, and that of the simulated world."""
     method: str
+    capture_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,7 @@ def calibrate_once(job: CalibrationJob, feedback: Progress) -> CalibrationResult
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],
             method=job.method,
-            capture_time=1.0,
+            capture_time=job.capture_s,
             frequency=70.0,
         )
 
