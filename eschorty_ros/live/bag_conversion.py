@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
-from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.numbers import file_path, short
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.base.schema import validate
 from eschorty_ros.core.base.yaml_file import Document, parse_yaml

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array, positive
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import positive
 from eschorty_ros.core.storage.cloud import MIXED, SENSOR_EDGE
 from eschorty_ros.surfaces.profiles import period_s, profile_index
 

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array, number
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import number
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, links, organise, smoothed
 from eschorty_ros.surfaces.plane import (
     COMMON_SHARE,

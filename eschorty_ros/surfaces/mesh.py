@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array, file_path, positive
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import folder_beside
+from eschorty_ros.core.base.numbers import file_path, positive
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array, positive
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD, positive
 from eschorty_ros.core.base.progress import Progress
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import integer
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.surfaces.profiles import profile_begins
 
 COLOURS = ("range", "sigma", "reflectance", "pass")

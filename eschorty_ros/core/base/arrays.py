@@ -8,37 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import (
-    SMALLEST,
-    TIME_LIMIT,
-    file_path,
-    integer,
-    number,
-    number_or_nan,
-    positive,
-    short,
-)
-
-__all__ = [
-    "SMALLEST",
-    "TIME_LIMIT",
-    "Array",
-    "as_array",
-    "broadcast",
-    "byte_view",
-    "exact",
-    "file_path",
-    "integer",
-    "integer_vector",
-    "number",
-    "number_or_nan",
-    "positive",
-    "reals",
-    "selection",
-    "short",
-    "times",
-    "vector",
-]
+from eschorty_ros.core.base.numbers import TIME_LIMIT, short
 
 Array = NDArray[np.float64]
 """float64 values of any shape."""

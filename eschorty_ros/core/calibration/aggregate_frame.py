@@ -6,8 +6,9 @@ import numpy as np
 from numba import int64, types, uint16, uint32
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import exact, integer
+from eschorty_ros.core.base.arrays import exact
 from eschorty_ros.core.base.kernel import entry_kernel
+from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.evt3 import Events
 from eschorty_ros.core.optics import PIXELS_MAX
 

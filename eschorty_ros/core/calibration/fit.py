@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import Array, broadcast, positive, reals
+from eschorty_ros.core.base.arrays import Array, broadcast, reals
 from eschorty_ros.core.base.errors import ArgumentError, FitError
+from eschorty_ros.core.base.numbers import positive
 from eschorty_ros.core.calibration.residuals import (
     COLUMN_TERMS,
     EVERY,

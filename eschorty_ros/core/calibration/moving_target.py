@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import integer, number, reals
+from eschorty_ros.core.base.arrays import reals
 from eschorty_ros.core.base.errors import ArgumentError, FitError
+from eschorty_ros.core.base.numbers import integer, number
 from eschorty_ros.core.calibration.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.line import SIGMA_FLOOR_PX

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eschorty_ros.core.base.arrays import number, number_or_nan, positive
 from eschorty_ros.core.base.errors import ArgumentError, FitError
+from eschorty_ros.core.base.numbers import number, number_or_nan, positive
 from eschorty_ros.core.calibration.post_finder import Post
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel

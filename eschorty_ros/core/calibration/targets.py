@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import Array, reals, selection, short
+from eschorty_ros.core.base.arrays import Array, reals, selection
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import short
 
 SIGMA_ROW_PX = 0.3
 """Standard deviation of a centroid by default."""

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write, read_regular_file
-from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.numbers import file_path, short
 from eschorty_ros.core.calibration.post_matching import KnownTarget
 from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, SIGMA_WIDTH_PX, Targets
 

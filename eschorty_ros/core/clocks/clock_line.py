@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, times
+from eschorty_ros.core.base.arrays import times
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 
 NS_PER_US = 1_000
 DRIFT_MAX_PPB = 200_000

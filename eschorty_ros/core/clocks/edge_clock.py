@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT
+from eschorty_ros.core.base.numbers import TIME_LIMIT
 from eschorty_ros.core.clocks.clock_line import NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.edge_fit import EdgeFit, fit_edges
 from eschorty_ros.core.clocks.pulses import PulseTrain, checked_edges, leading_edges

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
-from eschorty_ros.core.base.numbers import SIGMA_PER_MAD
+from eschorty_ros.core.base.arrays import integer_vector
+from eschorty_ros.core.base.numbers import SIGMA_PER_MAD, TIME_LIMIT
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.pulses import PulseTrain
 from eschorty_ros.core.clocks.stage_track import StageTrack

@@ -13,7 +13,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 
 _BINS = 600

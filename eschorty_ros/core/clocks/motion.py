@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, number, positive, times, vector
+from eschorty_ros.core.base.arrays import times, vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number, positive
 from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 
 

@@ -16,8 +16,9 @@ from statistics import median
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, integer, number, positive, times
+from eschorty_ros.core.base.arrays import Array, times
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number, positive
 from eschorty_ros.core.clocks.motion import MotionPlan
 from eschorty_ros.core.clocks.motion_leg import Leg, Move, Reading, Stop
 from eschorty_ros.core.clocks.motion_start import Delays

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, Array
+from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.numbers import TIME_LIMIT
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_stop
 from eschorty_ros.core.clocks.motion_start import Delays, Timing, fitted_shape, start_of
 

@@ -7,15 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import (
-    TIME_LIMIT,
-    integer,
-    integer_vector,
-    number,
-    positive,
-    reals,
-)
+from eschorty_ros.core.base.arrays import integer_vector, reals
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number, positive
 
 
 @dataclass(frozen=True, slots=True)

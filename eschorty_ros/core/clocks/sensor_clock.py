@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 from eschorty_ros.core.clocks.clock_line import T_US_LIMIT, ClockLine, Time
 from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
 

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.array_queue import ArrayQueue
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, times
+from eschorty_ros.core.base.arrays import reals, times
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 
 NM_PER_MM = 1_000_000
 POSITION_LIMIT_MM = 1e9

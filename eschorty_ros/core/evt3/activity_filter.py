@@ -12,9 +12,10 @@ from __future__ import annotations
 import numpy as np
 from numba import int32, int64, typeof, types, uint8, uint16, uint64
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
+from eschorty_ros.core.base.arrays import exact
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, _first_fall, event_arrays
 from eschorty_ros.core.evt3.words import ADDRESSES
 

@@ -7,9 +7,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import byte_view, integer
+from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.kernel import record
+from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.counters import COUNTS, Counters
 from eschorty_ros.core.evt3.events import Events, Triggers, event_arrays

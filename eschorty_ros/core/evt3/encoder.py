@@ -6,9 +6,10 @@ import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import integer, integer_vector
+from eschorty_ros.core.base.arrays import integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
+from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.events import EventArrays, _first_fall
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, integer_vector, number
+from eschorty_ros.core.base.arrays import integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number
 from eschorty_ros.core.line.blinking import Blink, recent_lines
 from eschorty_ros.core.line.centroid import _estimate_columns, empty_rows, make_row_counts
 from eschorty_ros.core.line.columns import grouped_columns

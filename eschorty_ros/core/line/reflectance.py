@@ -17,8 +17,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, integer_vector, number, vector
+from eschorty_ros.core.base.arrays import Array, integer_vector, vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, number
 
 ROOT_12 = math.sqrt(12.0)
 """Full width over standard deviation of evenly spread rows."""

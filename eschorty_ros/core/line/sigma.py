@@ -22,8 +22,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eschorty_ros.core.base.arrays import number
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.numbers import number
 
 SIGMA_FLOOR_PX = 0.25
 _SIGMA_LIMIT = 1e6

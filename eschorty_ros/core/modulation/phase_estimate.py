@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
+from eschorty_ros.core.base.arrays import integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT
 from eschorty_ros.core.modulation.fullest_rows import fullest_rows
 from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.modulation import Modulation

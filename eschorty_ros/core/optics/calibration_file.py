@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 import yaml
 
-from eschorty_ros.core.base.arrays import file_path, short
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
 from eschorty_ros.core.base.files import (
     BARE_NAME,
@@ -22,6 +21,7 @@ from eschorty_ros.core.base.files import (
     config_path,
     is_bare_name,
 )
+from eschorty_ros.core.base.numbers import file_path, short
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import parse_yaml, read_yaml
 from eschorty_ros.core.optics.range_model import (

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import Array, integer, number, positive, reals
+from eschorty_ros.core.base.arrays import Array, reals
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import integer, number, positive
 from eschorty_ros.core.optics.calibration_file import Calibration
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from eschorty_ros.core.base.arrays import number, positive
+from eschorty_ros.core.base.numbers import number, positive
 from eschorty_ros.core.optics.design import Design
 
 _PUPIL_MM, _EYE_AT_MM = 7.0, 100.0

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import Array, broadcast, integer, number, positive, reals
+from eschorty_ros.core.base.arrays import Array, broadcast, reals
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import integer, number, positive
 
 POLE_MARGIN_PX = 1.0
 PIXEL_UM = 4.86

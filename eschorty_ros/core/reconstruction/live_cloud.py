@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
+from eschorty_ros.core.base.arrays import exact
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
 

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, Self, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
+from eschorty_ros.core.base.arrays import exact, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel
-from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, short
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 from eschorty_ros.core.optics.range_model import (
     range_of_image_mm,

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer, short
+from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, short
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.evt3.cuts import triggers_of
 from eschorty_ros.core.line import relative_reflectance

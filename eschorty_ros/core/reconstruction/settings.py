@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, Self
 
-from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.line import CENTROIDS, RETURNS, SIGMA_FLOOR_PX, check_method
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import file_path, integer, short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError, OtherFormatError
 from eschorty_ros.core.base.files import atomic_write, open_regular_file
+from eschorty_ros.core.base.numbers import file_path, integer, short
 
 POINT_DTYPE = np.dtype(
     [

@@ -13,9 +13,10 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from eschorty_ros.core.base.arrays import byte_view, file_path, integer
+from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.base.files import GrowingFile, open_regular_file
+from eschorty_ros.core.base.numbers import file_path, integer
 from eschorty_ros.core.evt3 import words as w3
 
 CHUNK_BYTES = 128 * 1024

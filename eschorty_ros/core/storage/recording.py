@@ -18,9 +18,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector, short
+from eschorty_ros.core.base.arrays import as_array, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write, open_regular_file
+from eschorty_ros.core.base.numbers import file_path, short
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import read_yaml, write_yaml
 from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
