@@ -50,6 +50,16 @@ def integer_vector(
     return np.ascontiguousarray(array, dtype=dtype)
 
 
+def ordered_times(name: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Return ``values`` as a vector of times, us, that never fall."""
+    t_us = integer_vector(name, values, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    fall = np.flatnonzero(np.diff(t_us) < 0)
+    if fall.size:
+        before, after = t_us[fall[0]], t_us[fall[0] + 1]
+        raise ArgumentError(f"{name} goes from {before} to {after}; sort the events by time")
+    return t_us
+
+
 def exact(name: str, values: Any, dtype: DTypeLike, size: int | None = None) -> NDArray[Any]:
     """Return ``values`` for compiled code: one contiguous axis of exactly this dtype."""
     if not isinstance(values, np.ndarray) or values.dtype != dtype or values.ndim != 1:

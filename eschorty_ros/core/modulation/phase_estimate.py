@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import integer_vector
+from eschorty_ros.core.base.arrays import integer_vector, ordered_times
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import TIME_LIMIT
 from eschorty_ros.core.modulation.fullest_rows import fullest_rows
 from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.modulation import Modulation
@@ -60,11 +59,7 @@ def estimate_phase(
 
     Raises ``ArgumentError`` when there are no events, or they are not in time order.
     """
-    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-    fall = np.flatnonzero(np.diff(t_us) < 0)
-    if fall.size:
-        before, after = t_us[fall[0]], t_us[fall[0] + 1]
-        raise ArgumentError(f"t_us goes from {before} to {after}; sort the events by time")
+    t_us = ordered_times("t_us", t_us)
     polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
     if t_us.size == 0 or t_us.shape != polarity.shape:
         raise ArgumentError(

@@ -13,9 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import byte_view, integer_vector
+from eschorty_ros.core.base.arrays import byte_view, integer_vector, ordered_times
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import TIME_LIMIT
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
@@ -84,7 +83,7 @@ def reconstruct(
     Raises ``ArgumentError`` when the three arrays differ in length, times fall or a pixel is off
     the sensor.
     """
-    t = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    t = ordered_times("t_us", t_us)
     x = integer_vector("column", column, np.int64, 0, model.columns - 1)
     y = integer_vector("row", row, np.int64, 0, model.rows - 1)
     if not t.shape == x.shape == y.shape:
@@ -93,11 +92,6 @@ def reconstruct(
         )
     if t.size == 0:
         return Profiles.empty()
-    fall = np.flatnonzero(np.diff(t) < 0)
-    if fall.size:
-        raise ArgumentError(
-            f"t_us goes from {t[fall[0]]} to {t[fall[0] + 1]}; sort the events by time"
-        )
     origin = int(t[0]) if modulation.on_edge_us is None else modulation.on_edge_us
     anchored = Modulation(modulation.frequency_hz, modulation.duty, modulation.waveform, origin)
     first = int((int(t[0]) - origin) // modulation.period_us)
