@@ -70,6 +70,11 @@ class PeriodCutter:
         if self._begin(watermark_us):
             self._assign_held(watermark_us)
 
+    @property
+    def triggered(self) -> bool:
+        """Return whether triggers set the edges, and a period is open."""
+        return self.lock.schedule.triggered and self._sink.has_begun
+
     def _knows_ahead(self) -> bool:
         """Return whether the next edges are known before their events, and a period is open.
 

@@ -204,7 +204,7 @@ class Reconstructor:
         size, lock = _PIECE_WORDS, self._periods.lock
         if self._filter is None:
             piece = words[: PASS_WORDS if self._jobs == 1 or lock.tracks else None]
-            if lock.schedule.triggered and piece.size > _PIECE_WORDS:
+            if self._periods.triggered and piece.size > _PIECE_WORDS:
                 return self._add_triggered(piece), False
             read = self._add_words(piece)
             if read:

@@ -287,6 +287,20 @@ def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
     np.testing.assert_array_equal(late, edges[1:][: late.size])
 
 
+def test_triggers_before_the_first_edge_of_a_known_phase_lose_no_period(monkeypatch):
+    """In one piece as in many: events before the first edge are of no profile."""
+    modulation = Modulation(70.0, on_edge_us=1_000_000 - 60_000)
+    edges = np.rint(1_000_000 + np.arange(20) * 1e6 / 70).astype(int)
+    stream = encoded(lines(periods=20, columns=60, edge_us=1_000_000), edges)
+    settings = Settings(periods_per_profile=10)
+    parts, a = reconstruct(stream, modulation, settings, range(0, len(stream), 512))
+    monkeypatch.setattr(reconstructor, "_PIECE_WORDS", 1 << 11)
+    whole, b = reconstruct(stream, modulation, settings)
+    assert_same(parts, whole)
+    assert a.counters == b.counters
+    assert whole.edge_us.min() > edges[0]
+
+
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time(every):
     """Wherever in the profile's count the stretch of more than 4096 periods begins."""
