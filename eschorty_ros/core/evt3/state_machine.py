@@ -46,7 +46,7 @@ _STATE = (
     "low",  # payload of the last TIME_LOW
     "held_high",  # TIME_HIGH that awaits confirmation, -1 for none
     "t_us",  # current time
-    "floor_us",  # time of the newest event; time never falls below it
+    "floor_us",  # time of the newest event or trigger; time never falls below it
     "row",
     "limit",  # sensor width while the row is valid, else 0: one comparison checks both
     "base",  # column of the next vector's first bit
@@ -58,6 +58,7 @@ _STATE = (
     "late",  # _IN_TIME; _LATE while the time is past the last to decode, _STOPPED at an event
     "held_confirmed",  # words that have confirmed ``held_high``
     "held_broken",  # broken words counted before it
+    "event_us",  # time of the newest event
 )
 _IN_TIME, _LATE, _STOPPED = range(3)
 _FOREVER_US = 1 << 62
@@ -361,6 +362,7 @@ def _decode(words, i, until_us, through, memory, sink):
     t = s.t_us
     floor = s.floor_us
     mark = np.uint64(0)
+    before_trigger = np.uint64(0)
     row = s.row
     s.late = _LATE if t >= until_us else _IN_TIME
     if i < end and s.triple > 0:
@@ -454,6 +456,9 @@ def _decode(words, i, until_us, through, memory, sink):
             if not through:
                 i -= one
                 break
+            if n != before_trigger:
+                before_trigger = n
+                s.event_us = t if n + m != mark else floor
             if m < np.uint64(triggers.t.size):
                 triggers.t[m] = t
                 triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
@@ -483,6 +488,8 @@ def _decode(words, i, until_us, through, memory, sink):
             c.unknown_words += 1
     s.t_us = t
     s.floor_us = t if n + m != mark else floor
+    if n != before_trigger:
+        s.event_us = s.floor_us
     s.row = row
     s.limit = width if np.uint64(row) < np.uint64(height) else 0
     s.base = base

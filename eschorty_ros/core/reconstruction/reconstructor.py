@@ -262,7 +262,7 @@ class Reconstructor:
             read = self._periods.add_triggered(*pass_, watermark_us)
         events = int(counts["events"]) - before
         if events:
-            self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
+            self.newest_t_us = max(self._decoder.event_us, self._watermark_us)
             self._counts["events"] += events
         self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
         return read

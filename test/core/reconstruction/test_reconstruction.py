@@ -301,6 +301,17 @@ def test_triggers_before_the_first_edge_of_a_known_phase_lose_no_period(monkeypa
     assert whole.edge_us.min() > edges[0]
 
 
+def test_triggers_after_the_last_event_are_not_its_time(monkeypatch):
+    monkeypatch.setattr(reconstructor, "_PIECE_WORDS", 1 << 12)
+    edges = 1000 + np.arange(60) * 2000
+    events = lines(frequency_hz=500.0, periods=40, columns=60)
+    stream = encoded(events, edges)
+    _, whole = reconstruct(stream, Modulation(500.0))
+    _, parts = reconstruct(stream, Modulation(500.0), None, range(0, len(stream), 2048))
+    assert whole.newest_t_us == parts.newest_t_us == events[0][-1]
+    assert whole.counters == parts.counters
+
+
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time(every):
     """Wherever in the profile's count the stretch of more than 4096 periods begins."""
