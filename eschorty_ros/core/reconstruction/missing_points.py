@@ -173,7 +173,8 @@ def _weak(
     return (
         f"{weak} columns ({weak / columns:.0%} of those with events at the line's row) have fewer "
         f"than events_min = {settings.events_min} and gave no points; "
-        f"{longer if periods_per_profile < most else ''}let the camera send more events"
+        f"{longer if periods_per_profile < most else ''}lower the camera's contrast thresholds "
+        "(bias_diff_on, bias_diff_off)"
     )
 
 
