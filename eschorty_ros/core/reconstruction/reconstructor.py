@@ -210,7 +210,9 @@ class Reconstructor:
             if read:
                 return read, True
             size = _BLOCK_WORDS if lock.observes else _PIECE_WORDS
-        self._add_events(words[:size])
+        events = self._decoded(words[:size])
+        self._add_triggers(events.triggers)
+        self._periods.add(self._filtered(events), self._watermark_us)
         return min(size, words.size), False
 
     def _add_triggered(self, words: NDArray[np.uint16]) -> int:
@@ -220,16 +222,9 @@ class Reconstructor:
         watermark_us = max(self._watermark_us, ahead.settled_us or 0)
         read = self._add_words(words, watermark_us)
         for begin in range(read, words.size, _PIECE_WORDS):
-            self._add_events(words[begin : begin + _PIECE_WORDS], know_triggers=True)
+            events = self._decoded(words[begin : begin + _PIECE_WORDS])
+            self._periods.add(events, self._watermark_us)
         return words.size
-
-    def _add_events(self, words: NDArray[np.uint16], *, know_triggers: bool = False) -> None:
-        """Decode and store the events of words, then assign those that are certain."""
-        events = self._decoded(words)
-        if events is not None:
-            if len(events.triggers) and not know_triggers:
-                self._add_triggers(events.triggers)
-            self._periods.add(self._filtered(events), self._watermark_us)
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
@@ -267,12 +262,9 @@ class Reconstructor:
         self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
         return read
 
-    def _decoded(self, piece: NDArray[np.uint16]) -> Events | None:
-        """Return the events of ``piece``, or ``None`` before the stream's first time."""
+    def _decoded(self, piece: NDArray[np.uint16]) -> Events:
+        """Return the events of ``piece``, stored."""
         events = self._decoder.decode_words(piece)
-        settled_us = self._decoder.settled_us
-        if settled_us is None:
-            return None
         if len(events):
             # Periods before it are closed: a TIME_HIGH that steps back must not reopen them.
             if events.t[0] < self._watermark_us:
@@ -281,11 +273,13 @@ class Reconstructor:
                 self.first_t_us = int(events.t[0])
             self.newest_t_us = int(events.t[-1])
             self._counts["events"] += len(events)
-        self._watermark_us = max(self._watermark_us, settled_us)
+        self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
         return events
 
     def _add_triggers(self, triggers: Triggers) -> None:
         source = self.settings.trigger_source
+        if not len(triggers):
+            return
         if source == "laser":
             self._periods.lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
         elif source == "stage" and len(self._stage_edges) < _STAGE_EDGES_MAX:
