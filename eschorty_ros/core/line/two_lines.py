@@ -86,7 +86,7 @@ def _column_sides(packed, start, seed, half, polarities, unequal):
 
 @kernel(_nrt=False)
 def _two_sides(packed, start, seed, half, unequal):
-    """Return what `_column_sides` does of the polarity with more events, and whether it has two.
+    """Return `_column_sides` of the polarity with more events, and whether there are two lines.
 
     ON and OFF events of a line that moves while it is lit are apart. Those of one polarity may miss
     in the middle of a line whose pixels give the other one there: both together show no gap then.

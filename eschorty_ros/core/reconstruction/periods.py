@@ -126,7 +126,10 @@ class PeriodCutter:
     def add_triggered(
         self, words: NDArray[np.uint16], decoder: Decoder, floor_us: int, watermark_us: int
     ) -> int:
-        """Do as `add_words` where triggers set the edges, all before ``watermark_us`` known."""
+        """Decode ``words`` as `add_words` does where triggers set the edges.
+
+        All triggers before ``watermark_us`` are known.
+        """
         sink, lock, schedule = self._sink, self.lock, self.lock.schedule
         read, more = 0, True
         while more:
