@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, short
+from eschorty_ros.core.base.numbers import integer, short
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.evt3.cuts import triggers_of
 from eschorty_ros.core.line import relative_reflectance
@@ -133,7 +133,7 @@ class Reconstructor:
             points_outside_roi=0, points_flagged=0, points_cut=0, events_used=0,
             columns_compensated=0,
         )  # fmt: skip
-        self._watermark_us = -TIME_LIMIT
+        self._watermark_us = 0
         self._periods_before = 0
         self._before_restart: list[Profiles] = []
         self._each: Callable[[Profiles], Any]
