@@ -64,13 +64,12 @@ def _are_apart(whole, sides):
 
 
 @kernel(_nrt=False)
-def _column_sides(packed, start, seed, half, polarities, unequal):
+def _column_sides(packed, start, seed, half, polarities, every, unequal):
     """Return the variance of a column's rows, and that on either side of a row that parts them.
 
     It is their mean. The mean of ``unequal`` lines is in the stronger one: these are parted in the
-    middle of both sides' means. Zeros where there are too few events.
+    middle of both sides' means. Zeros where there are too few events; ``every`` are their sums.
     """
-    every, _ = _side_sums(packed, start, seed, half, polarities, np.inf)
     if every[0] < _EVENTS_MIN:
         return 0.0, 0.0
     low = high = every
@@ -93,11 +92,13 @@ def _two_sides(packed, start, seed, half, unequal):
     """
     on, _ = _side_sums(packed, start, seed, half, _ON, np.inf)
     off, _ = _side_sums(packed, start, seed, half, _OFF, np.inf)
-    more = _ON if on[0] >= off[0] else _OFF
-    whole, sides = _column_sides(packed, start, seed, half, more, unequal)
+    more, every = (_ON, on) if on[0] >= off[0] else (_OFF, off)
+    whole, sides = _column_sides(packed, start, seed, half, more, every, unequal)
     has_two = _are_apart(whole, sides)
     if has_two:
-        has_two = _are_apart(*_column_sides(packed, start, seed, half, _ON | _OFF, unequal))
+        every = on[0] + off[0], on[1] + off[1], on[2] + off[2]
+        both = _column_sides(packed, start, seed, half, _ON | _OFF, every, unequal)
+        has_two = _are_apart(both[0], both[1])
     return whole, sides, has_two
 
 
