@@ -163,13 +163,13 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
                 np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("case", ["estimate", "drift", "stage"])
-def test_threads_work_where_the_phase_is_tracked(case, monkeypatch):
+@pytest.mark.parametrize("case", ["estimate", "drift", "stage", "trigger"])
+def test_threads_work_where_events_or_triggers_show_the_phase(case, monkeypatch):
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
     monkeypatch.setattr(reconstructor, "PASS_WORDS", 1 << 14)
     monkeypatch.setattr(reconstructor, "_PIECE_WORDS", 1 << 12)
-    assemble = windows.WindowAssembler._assemble
-    threads = Counter()
+    assemble, merge = windows.WindowAssembler._assemble, windows.WindowAssembler.merge_words
+    threads, sizes = Counter(), []
 
     def counted(self, begin, decoder, assembler):
         before = assembler.counters["events_binned"]
@@ -177,12 +177,19 @@ def test_threads_work_where_the_phase_is_tracked(case, monkeypatch):
         threads[threading.get_ident()] += assembler.counters["events_binned"] - before
         return result
 
+    def measured(self, words, *others):
+        sizes.append(words.size)
+        return merge(self, words, *others)
+
     monkeypatch.setattr(windows.WindowAssembler, "_assemble", counted)
+    monkeypatch.setattr(windows.WindowAssembler, "merge_words", measured)
     stream, modulation, settings = SPLIT_CASES[case]
     parallel = Reconstructor(CALIBRATION, modulation, settings, 2)
     parallel.push(stream)
     threads.pop(threading.get_ident(), None)
     assert threads.total() > 0.5 * parallel.counters["events"], f"seed {SEED}"
+    # In small pieces threads would wait for each other.
+    assert 2 * max(sizes) > 0.5 * len(stream), f"seed {SEED}"
 
 
 def test_lines_have_their_usual_width_where_a_gate_changes(monkeypatch):
