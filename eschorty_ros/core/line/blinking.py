@@ -35,7 +35,7 @@ from eschorty_ros.core.modulation import Modulation
 PERIOD_MIN_US = 900.0
 # Least vector strength of a point, and least events times its square: Rayleigh's test. Few events
 # reach it only with a square near 1.
-_STRENGTH_MIN = 0.5
+STRENGTH_MIN = 0.5
 _RAYLEIGH_MIN = 4.0
 _SQUARE_ENOUGH = 0.6
 # Background reaches this statistic once in 160 000 windows.
@@ -177,7 +177,7 @@ def _is_alike(vector, blink):
 @kernel
 def _has_direction(lines):
     """Return whether the mean phase of recent lines is known: their vector strength is enough."""
-    least = _STRENGTH_MIN * lines.number
+    least = STRENGTH_MIN * lines.number
     return lines.number >= _LINES_MIN and lines.x * lines.x + lines.y * lines.y > least * least
 
 
@@ -249,12 +249,12 @@ def _laser_test(column, first, last, blink):
     n = float(vector.events)
     square = length2 / (n * n * _UNIT * _UNIT)
     rayleigh = n * square
-    if square > _STRENGTH_MIN**2:
+    if square > STRENGTH_MIN**2:
         alike = _is_alike(vector, blink)
         follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
         # In a known direction few events have this strength by chance about as rarely.
         if not follows and _has_direction(blink.lines):
-            follows = np.sqrt(square) * _cosine(vector, blink) > _STRENGTH_MIN
+            follows = np.sqrt(square) * _cosine(vector, blink) > STRENGTH_MIN
         return _LaserTest(alike & follows, alike & (rayleigh > _RAYLEIGH_SURE))
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
-from eschorty_ros.core.line.blinking import PERIOD_MIN_US
+from eschorty_ros.core.line.blinking import PERIOD_MIN_US, STRENGTH_MIN
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents, sample
 from eschorty_ros.core.modulation.phase_estimate import (
@@ -44,8 +44,6 @@ _SAMPLE = 1 << 16
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
 _CELL_BITS = 4
 _LINE_CELLS_MAX = 8.0
-# Vector strength of events of which most follow the laser, as for those of a column.
-_FOLLOW_STRENGTH = 0.5
 
 
 def periods_max(modulation: Modulation) -> int:
@@ -178,10 +176,11 @@ class ProfileLength:
 
     def _is_everywhere(self, held: HeldEvents, begin: int, end: int) -> bool:
         """Return whether events of a window follow the laser and are in many rows of a column."""
-        t_us, columns, rows, polarity = (values[begin:end] for values in held.arrays)
+        events = sample([values[begin:end] for values in held.arrays], _SAMPLE)
+        t_us, columns, rows, polarity = events
         if begin == end or _is_line(columns, rows):
             return False
-        return estimate_phase(t_us, polarity, self._modulation).strength > _FOLLOW_STRENGTH
+        return estimate_phase(t_us, polarity, self._modulation).strength > STRENGTH_MIN
 
     def _periods(
         self, turns: Array, columns: NDArray[np.uint16], rows: NDArray[np.uint16], enough: int
