@@ -25,7 +25,11 @@ class Boxed(structref.StructRefProxy):
 
     def __new__(cls, content: Any) -> Boxed:
         """Return ``content`` boxed."""
-        boxed: Boxed = _box()(content)
+        try:
+            boxed: Boxed = _box()(content)
+        except SystemError as error:
+            # numba makes an object by Python's code, and does not see that this is interrupted.
+            raise error.__cause__ or error from None
         return boxed
 
 

@@ -18,7 +18,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 from numba.core.registry import CPUDispatcher
 from numpy.typing import NDArray
 
@@ -30,8 +30,8 @@ def entry_kernel(*arguments: Any, **options: Any) -> Any:
     for these signatures only. Keyword options are those of ``numba.njit``.
     """
     if len(arguments) == 1 and hasattr(arguments[0], "__code__"):
-        return _compiled(arguments[0], (), options)
-    return lambda function: _compiled(function, arguments, options)
+        return _compiled(_Entry, arguments[0], (), options)
+    return lambda function: _compiled(_Entry, function, arguments, options)
 
 
 def kernel(*function: Any, **options: Any) -> Any:
@@ -50,9 +50,29 @@ def kernel(*function: Any, **options: Any) -> Any:
     """
     if not function:
         return lambda function: kernel(function, **options)
-    compiled = entry_kernel(*function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
-    compiled.__class__ = _Inner
-    return compiled
+    options = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, **options}
+    return _compiled(_Inner, function[0], (), options)
+
+
+class _Entry(CPUDispatcher):
+    """A compiled function that Python calls, and that returns no named tuple.
+
+    numba runs Python to make one. Where that is interrupted, as by Ctrl-C, the process crashes.
+    """
+
+    def compile(self, signature: Any) -> Any:
+        compiled = super().compile(signature)
+        if any(_is_named(each.signature.return_type) for each in self.overloads.values()):
+            name = self.py_func.__qualname__
+            raise TypeError(f"{name} returns a named tuple; return a plain one")
+        return compiled
+
+
+def _is_named(result: types.Type) -> bool:
+    """Return whether a type is a named tuple, or a tuple with one in it."""
+    if not isinstance(result, types.BaseTuple):
+        return False
+    return isinstance(result, types.BaseNamedTuple) or any(map(_is_named, result))
 
 
 class _Inner(CPUDispatcher):
@@ -62,8 +82,14 @@ class _Inner(CPUDispatcher):
         raise TypeError(f"only kernels call {self.py_func.__qualname__}; make it an entry_kernel")
 
 
-def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...], options: Any) -> Any:
+def _compiled(
+    kind: type[CPUDispatcher],
+    function: Callable[..., Any],
+    signatures: tuple[Any, ...],
+    options: Any,
+) -> Any:
     dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    dispatcher.__class__ = kind
     # numba has no public way to say what a cached function depends on.
     index = dispatcher._cache._cache_file
     index._source_stamp = dispatcher.source_digest = _digest(function)

@@ -156,7 +156,7 @@ def _find(words, word, edge, edges_us, events, through, memory):
         epochs[k], highs[k] = epoch_us, high
         at += np.uintp(BLOCK)
     if at + np.uintp(BLOCK) > size:
-        return Cut(-1, edge)
+        return np.int64(-1), edge
     none = np.uint64(0)
     if blocks > lead:
         begin = at - np.uintp(_LEAD)
@@ -171,7 +171,7 @@ def _find(words, word, edge, edges_us, events, through, memory):
         begin = np.uintp(word)
     i, _, _ = _decode_over(words[:at], np.uint64(begin), _FOREVER_US, through, memory, 0)
     if i < np.uint64(at):
-        return Cut(-1, edge)
+        return np.int64(-1), edge
     while edge < edges_us.size:
         if edges_us[edge] > s.floor_us:
             i, n, _ = _decode_over(words, i, edges_us[edge], through, memory, 0)
@@ -179,6 +179,6 @@ def _find(words, word, edge, edges_us, events, through, memory):
             if i == np.uint64(size) or words[i] >> 12 == w3.EXT_TRIGGER:
                 break
             if total >= events:
-                return Cut(np.int64(i), edge + 1)
+                return np.int64(i), edge + 1
         edge += 1
-    return Cut(-1, edge)
+    return np.int64(-1), edge

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import entry_kernel, kernel
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.column_returns import _column_returns, _is_clear, _is_cut, _reported
 from eschorty_ros.core.line.estimators import (
     _ALL,
@@ -327,7 +327,7 @@ def _are_two_near(packed, start, events, centre, half):
     return near >= 2
 
 
-@entry_kernel(_nrt=False)
+@kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out``.
 

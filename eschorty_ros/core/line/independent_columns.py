@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.kernel import entry_kernel
 from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number
 from eschorty_ros.core.line.blinking import Blink, recent_lines
 from eschorty_ros.core.line.centroid import _estimate_columns, empty_rows, make_row_counts
@@ -41,6 +42,12 @@ class Centroids:
     """Two separate, equally dense groups of events with ``returns="strongest"``: no row."""
     edge: NDArray[np.bool_]
     """The first or last row of the sensor cuts the line, which ``sigma_row`` allows for."""
+
+
+@entry_kernel(_nrt=False)
+def _estimate(columns, estimator, blink, footprint, out, row_counts):
+    """Estimate the rows of every column into ``out``."""
+    _estimate_columns(columns, estimator.half_max, estimator, blink, footprint, out, row_counts)
 
 
 def estimate(
@@ -112,7 +119,7 @@ def estimate(
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()
     footprint, blink = make_footprint(estimator.half_max, columns=0), Blink(lines=recent_lines())
-    _estimate_columns(columns, estimator.half_max, estimator, blink, footprint, found, row_counts)
+    _estimate(columns, estimator, blink, footprint, found, row_counts)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (
         np.ascontiguousarray(values.T[:, by_column])

@@ -211,14 +211,16 @@ class EdgeSchedule:
         events, then call again.
         """
         # Plain tuples cross into compiled code faster than named ones.
-        new = _schedule(
-            tuple(self._state),
-            tuple(self._counts),
-            self._parts,
-            self._triggers_us,
-            watermark_us,
-            self._edges_us,
-            self._indices,
+        new = _Advance(
+            *_schedule(
+                tuple(self._state),
+                tuple(self._counts),
+                self._parts,
+                self._triggers_us,
+                watermark_us,
+                self._edges_us,
+                self._indices,
+            )
         )
         self.safe_us = new.safe_us
         self._state, self._counts = _State._make(new.state), _Counts._make(new.counts)
@@ -282,7 +284,10 @@ def _agree(trigger_us, next_us, period, tolerance_us):
 
 @entry_kernel
 def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indices):
-    """Write the edges that are certain once everything before the watermark is known."""
+    """Write the edges that are certain once everything before the watermark is known.
+
+    Returns what an `_Advance` is made of.
+    """
     anchor_us, step, at_us, remainder, index, last_us, triggered, missed, lone_us = state
     used, spurious, bridged, locks = counts
     tolerance_us = _tolerance_us(period)
@@ -341,4 +346,4 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
             indices[n] = index
             n += 1
     state = anchor_us, step, at_us, remainder, index, last_us, triggered, missed, lone_us
-    return _Advance(n, taken, safe_us, state, (used, spurious, bridged, locks))
+    return n, taken, safe_us, state, (used, spurious, bridged, locks)

@@ -205,7 +205,7 @@ class ProfileAssembler:
         size = held[0].size + new[0].size
         progress = _Progress(0, 0)
         while True:
-            progress = _merge(*parts, edges, progress, self._boxed)
+            progress = _Progress(*_merge(*parts, edges, progress, self._boxed))
             self._widen()
             if progress.event == size and progress.edge == edges.t_us.size:
                 return
@@ -229,7 +229,8 @@ class ProfileAssembler:
         progress = _Progress(0, 0)
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
-            progress = _merge_words(words, progress, decoder.boxed, span, edges, self._boxed)
+            arguments = words, progress, decoder.boxed, span, edges, self._boxed
+            progress = _Progress(*_merge_words(*arguments))
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
                 self._collect()
@@ -370,9 +371,9 @@ def _merge(held, new, edges, progress, boxed):
     if i < size:
         i, edge = _merge_part(held, edges, i, edge, False, period, memory)
         if i < size:
-            return _Progress(i, edge)
+            return i, edge
     i, edge = _merge_part(new, edges, i - size, edge, True, period, memory)
-    return _Progress(size + i, edge)
+    return size + i, edge
 
 
 _decode_into_bins = decode_into(_bin, "bins")
@@ -447,4 +448,5 @@ def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     period, decoder = boxed.content, boxed_decoder.content
     memory = period.memory.content
     before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
-    return _pass(words, progress, decoder, span, edges, period, memory, before)
+    reached = _pass(words, progress, decoder, span, edges, period, memory, before)
+    return reached.event, reached.edge

@@ -164,3 +164,28 @@ print(len(_box().stats.cache_misses))
         subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2)
     ]
     assert results[1].stdout == "0\n", results[1].stderr
+
+
+def test_a_kernel_that_python_calls_returns_no_named_tuple(tmp_path):
+    """numba makes one in a way that an interrupt at that moment turns into a crash."""
+    code = """
+from typing import NamedTuple
+from eschorty_ros.core.base.kernel import entry_kernel
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+@entry_kernel
+def _pair(n):
+    return 1, {result}
+
+try:
+    print(_pair(2))
+except TypeError as error:
+    print(error)
+"""
+    results = {"(n, n)": "(1, (2, 2))", "Pair(n, n)": "_pair returns a named tuple"}
+    for result, words in results.items():
+        (tmp_path / "pairs.py").write_text(code.format(result=result))
+        assert words in output(tmp_path, str(tmp_path / "pairs.py"))
