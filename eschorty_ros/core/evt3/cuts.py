@@ -7,12 +7,12 @@ the true one (`Decoder.is_at`) when that is known.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import entry_kernel, kernel
+from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.decoder import Decoder
 from eschorty_ros.core.evt3.events import Triggers
@@ -21,6 +21,7 @@ from eschorty_ros.core.evt3.state_machine import (
     _NO_ROW,
     _RUNNING,
     _bounds,
+    _keep,
     decode_into,
 )
 
@@ -53,7 +54,7 @@ def next_cut(
     ``None`` where there is none, or without ``through`` a trigger is before it. ``decoder`` is at
     ``cut``; its state becomes that of the cut returned, its counts have no meaning.
     """
-    found = Cut(*_find(words, *cut, edges_us, events, through, decoder.memory))
+    found = Cut(*_find(words, *cut, edges_us, events, through, decoder.memory, _passed()))
     return None if found.word < 0 else found
 
 
@@ -62,15 +63,16 @@ def pass_over(words: NDArray[np.uint16], until_us: int, decoder: Decoder) -> int
 
     It ends before the first event at ``until_us`` or later, and before a trigger.
     """
-    return int(_pass_words_over(words, until_us, False, decoder.memory)[0])
+    return int(_pass_words_over(words, until_us, False, decoder.memory, _passed())[0])
 
 
-def triggers_of(words: NDArray[np.uint16], decoder: Decoder) -> Triggers:
-    """Decode ``words`` without their events; return the triggers."""
+def triggers_of(words: NDArray[np.uint16], decoder: Decoder) -> tuple[Triggers, int]:
+    """Decode ``words`` without their events; return the triggers and the newest event's time."""
     decoder.make_room(int(_bounds(words)[1]))
-    _, m = _pass_words_over(words, _FOREVER_US, True, decoder.memory)
+    passed = _passed()
+    _, m = _pass_words_over(words, _FOREVER_US, True, decoder.memory, passed)
     t_us, channel, edge = decoder.memory.triggers
-    return Triggers(t_us[:m], channel[:m], edge[:m])
+    return Triggers(t_us[:m], channel[:m], edge[:m]), int(passed["newest_us"])
 
 
 class _Block(NamedTuple):
@@ -84,19 +86,35 @@ class _Block(NamedTuple):
     base: np.uint32
 
 
+def _passed() -> Any:
+    """Return a record of the events before the last trigger: their number and the newest's time."""
+    return record("events", "newest_us")
+
+
 @kernel
 def _pass_over(sink, n, t_us, column, row, polarity):
     """Count an event."""
     return n + np.uint64(1)
 
 
-_decode_over = decode_into(_pass_over, "over")
+@kernel
+def _keep_within(passed, triggers, m, t_us, word, n, event_us):
+    """Store a trigger where there is room, and the time of the newest event before it."""
+    if n != np.uint64(passed.events):
+        passed.events, passed.newest_us = n, event_us
+    if m < np.uint64(triggers.t.size):
+        _keep(passed, triggers, m, t_us, word, n, event_us)
+
+
+_decode_over = decode_into(_pass_over, "over", _keep_within)
 
 
 @entry_kernel
-def _pass_words_over(words, until_us, through, memory):
+def _pass_words_over(words, until_us, through, memory, passed):
     """Return the numbers of words decoded and of triggers stored."""
-    i, _, m = _decode_over(words, np.uint64(0), until_us, through, memory, 0)
+    i, n, m = _decode_over(words, np.uint64(0), until_us, through, memory, passed)
+    if n != np.uint64(passed.events):
+        passed.newest_us = memory.state.floor_us
     return np.int64(i), np.int64(m)
 
 
@@ -123,7 +141,7 @@ def _scan(words, begin, end):
 
 
 @entry_kernel
-def _find(words, word, edge, edges_us, events, through, memory):
+def _find(words, word, edge, edges_us, events, through, memory, passed):
     """Advance the decoder to the next cut after ``events`` events; return it, -1 for none.
 
     ``memory`` is the decoder's at ``word``, the beginning of the open window.
@@ -162,19 +180,19 @@ def _find(words, word, edge, edges_us, events, through, memory):
         begin = at - np.uintp(_LEAD)
         if has_base and base_at < begin:
             near = words[base_at : base_at + np.uintp(_BASE_LEAD)]
-            _decode_over(near, none, _FOREVER_US, through, memory, 0)
+            _decode_over(near, none, _FOREVER_US, through, memory, passed)
         k = (blocks - lead) % (lead + 1)
         s.run, s.epoch_us, s.high, s.low, s.held_high = _RUNNING, epochs[k], highs[k], 0, -1
         s.t_us, s.floor_us = epochs[k], epochs[k]
         s.row, s.limit, s.triple, s.others_parts = _NO_ROW, 0, 0, 0
     else:
         begin = np.uintp(word)
-    i, _, _ = _decode_over(words[:at], np.uint64(begin), _FOREVER_US, through, memory, 0)
+    i, _, _ = _decode_over(words[:at], np.uint64(begin), _FOREVER_US, through, memory, passed)
     if i < np.uint64(at):
         return np.int64(-1), edge
     while edge < edges_us.size:
         if edges_us[edge] > s.floor_us:
-            i, n, _ = _decode_over(words, i, edges_us[edge], through, memory, 0)
+            i, n, _ = _decode_over(words, i, edges_us[edge], through, memory, passed)
             total += np.int64(n)
             if i == np.uint64(size) or words[i] >> 12 == w3.EXT_TRIGGER:
                 break

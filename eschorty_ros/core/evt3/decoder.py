@@ -111,11 +111,6 @@ class Decoder:
         return int(self._state["floor_us"])
 
     @property
-    def event_us(self) -> int:
-        """Time of the newest event."""
-        return int(self._state["event_us"])
-
-    @property
     def settled_us(self) -> int | None:
         """Time before which no event can come any more; ``None`` before the first TIME_HIGH.
 

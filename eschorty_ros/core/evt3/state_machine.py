@@ -2,8 +2,9 @@
 
 The frequent words (ADDR_Y, ADDR_X, complete vector triples, TIME_LOW) are handled in the loop of
 ``_decode``, all others in small functions. Each event goes to a sink by a kernel ``_emit(sink, n,
-t_us, column, row, polarity)``, which takes event number ``n`` and returns ``n + 1``. `decode_into`
-compiles the state machine for such a kernel; that of `Decoder` stores the events in arrays.
+t_us, column, row, polarity)``, which takes event number ``n`` and returns ``n + 1``, each trigger
+by a kernel ``_keep``. `decode_into` compiles the state machine for such kernels; those of `Decoder`
+store events and triggers in arrays.
 """
 
 from __future__ import annotations
@@ -58,7 +59,6 @@ _STATE = (
     "late",  # _IN_TIME; _LATE while the time is past the last to decode, _STOPPED at an event
     "held_confirmed",  # words that have confirmed ``held_high``
     "held_broken",  # broken words counted before it
-    "event_us",  # time of the newest event
 )
 _IN_TIME, _LATE, _STOPPED = range(3)
 _FOREVER_US = 1 << 62
@@ -268,6 +268,14 @@ def _emit(sink, n, t_us, column, row, polarity):
     return n + np.uint64(1)
 
 
+@kernel(_nrt=False)
+def _keep(sink, triggers, m, t_us, word, n, event_us):
+    """Store trigger number ``m``; the last of ``n`` events was at ``event_us``."""
+    triggers.t[m] = t_us
+    triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
+    triggers.edge[m] = np.uint8(word & np.uint32(1))
+
+
 @kernel
 def _is_late(mask, bits, s):
     """Return whether a vector's first event on the sensor is too late to decode."""
@@ -350,7 +358,7 @@ def _decode(words, i, until_us, through, memory, sink):
     """Decode ``words`` from ``i`` on; return the next index, the numbers of events and triggers.
 
     The pass stops before the first event at ``until_us`` or later, and without ``through`` before
-    the first trigger. Triggers are stored as far as their arrays have room.
+    the first trigger.
     """
     width, height, s, c, _, triggers = memory
     end = np.uint64(words.size)
@@ -362,7 +370,6 @@ def _decode(words, i, until_us, through, memory, sink):
     t = s.t_us
     floor = s.floor_us
     mark = np.uint64(0)
-    before_trigger = np.uint64(0)
     row = s.row
     s.late = _LATE if t >= until_us else _IN_TIME
     if i < end and s.triple > 0:
@@ -456,13 +463,7 @@ def _decode(words, i, until_us, through, memory, sink):
             if not through:
                 i -= one
                 break
-            if n != before_trigger:
-                before_trigger = n
-                s.event_us = t if n + m != mark else floor
-            if m < np.uint64(triggers.t.size):
-                triggers.t[m] = t
-                triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
-                triggers.edge[m] = np.uint8(word & np.uint32(1))
+            _keep(sink, triggers, m, t, word, n, t if n + m != mark else floor)
             m += one
         elif kind == w3.VECT_8:
             # It belongs to a triple whose first words are missing.
@@ -488,8 +489,6 @@ def _decode(words, i, until_us, through, memory, sink):
             c.unknown_words += 1
     s.t_us = t
     s.floor_us = t if n + m != mark else floor
-    if n != before_trigger:
-        s.event_us = s.floor_us
     s.row = row
     s.limit = width if np.uint64(row) < np.uint64(height) else 0
     s.base = base
@@ -500,11 +499,12 @@ def _decode(words, i, until_us, through, memory, sink):
     return i, n, m
 
 
-def decode_into(emit: Any, name: str) -> Any:
-    """Return ``_decode`` compiled for a kernel ``emit``; ``name`` distinguishes it from others."""
+def decode_into(emit: Any, name: str, keep: Any = _keep) -> Any:
+    """Return ``_decode`` compiled for these kernels; ``name`` distinguishes it from others."""
     vector = with_names(_vector, name, _emit=emit)
     triple = with_names(_triple_by_words, name, _vector=vector)
-    return with_names(_decode, name, _emit=emit, _vector=vector, _triple_by_words=triple)
+    others = {"_vector": vector, "_triple_by_words": triple}
+    return with_names(_decode, name, _emit=emit, _keep=keep, **others)
 
 
 _decode_stored = decode_into(_emit, "stored")

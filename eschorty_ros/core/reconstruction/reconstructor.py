@@ -218,9 +218,12 @@ class Reconstructor:
     def _add_triggered(self, words: NDArray[np.uint16]) -> int:
         """Find the triggers in words, then assign all their events; return the number read."""
         ahead = self._decoder.copied()
-        self._add_triggers(triggers_of(words, ahead))
+        triggers, newest_us = triggers_of(words, ahead)
+        self._add_triggers(triggers)
         watermark_us = max(self._watermark_us, ahead.settled_us or 0)
-        read = self._add_words(words, watermark_us)
+        before, pass_ = self._events_decoded, (words, self._decoder, self._watermark_us)
+        read = self._periods.add_triggered(*pass_, watermark_us)
+        self._count_since(before, newest_us)
         for begin in range(read, words.size, _PIECE_WORDS):
             events = self._decoded(words[begin : begin + _PIECE_WORDS])
             self._periods.add(events, self._watermark_us)
@@ -243,24 +246,24 @@ class Reconstructor:
     def _finished(self, rows: LineRows) -> Profiles:
         return self._with_ranges(self._compensated(self._with_reflectance(rows)))
 
-    def _add_words(self, words: NDArray[np.uint16], watermark_us: int | None = None) -> int:
-        """Decode words into periods without storing the events; return the number read.
-
-        - ``watermark_us``: Time before which all triggers are known, ``None`` without any.
-        """
-        counts = self._decoder.memory.counts
-        before = int(counts["events"])
-        pass_ = words, self._decoder, self._watermark_us
-        if watermark_us is None:
-            read = self._periods.add_words(*pass_)
-        else:
-            read = self._periods.add_triggered(*pass_, watermark_us)
-        events = int(counts["events"]) - before
-        if events:
-            self.newest_t_us = max(self._decoder.event_us, self._watermark_us)
-            self._counts["events"] += events
-        self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
+    def _add_words(self, words: NDArray[np.uint16]) -> int:
+        """Decode words into periods without storing the events; return the number read."""
+        before = self._events_decoded
+        read = self._periods.add_words(words, self._decoder, self._watermark_us)
+        self._count_since(before, self._decoder.newest_us)
         return read
+
+    @property
+    def _events_decoded(self) -> int:
+        return int(self._decoder.memory.counts["events"])
+
+    def _count_since(self, events: int, newest_us: int) -> None:
+        """Count the events decoded since there were this many; the last was at ``newest_us``."""
+        new = self._events_decoded - events
+        if new:
+            self.newest_t_us = max(newest_us, self._watermark_us)
+            self._counts["events"] += new
+        self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
 
     def _decoded(self, piece: NDArray[np.uint16]) -> Events:
         """Return the events of ``piece``, stored."""
