@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
+import signal
 import sys
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NoReturn
 
 import click
 
@@ -59,13 +62,14 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; an error of the package becomes one line, Ctrl-C exit code 130."""
+        """Run a command; an error of the package becomes one line, a signal 128 and its number."""
         # A terminal without a degree sign gets a question mark.
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")
         try:
-            return super().invoke(ctx)
+            with _ended_by_signals():
+                return super().invoke(ctx)
         except EschortyError as error:
             raise StatedFailure(str(error)) from error
         except BrokenPipeError:
@@ -76,6 +80,32 @@ class LazyGroup(click.Group):
         except KeyboardInterrupt:
             click.echo("eschorty: interrupted", err=True)
             ctx.exit(INTERRUPTED)
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Make SIGTERM, SIGHUP and SIGINT raise, so that every clean-up runs and the laser is disabled.
+
+    A shell starts a background job with SIGINT ignored. ``nohup`` ignores SIGHUP, and the command
+    goes on.
+    """
+    handlers: dict[int, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: _terminated,
+        signal.SIGHUP: _terminated,
+    }
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        del handlers[signal.SIGHUP]
+    previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _terminated(number: int, _: object) -> NoReturn:
+    sys.exit(128 + number)
 
 
 def _unusable(error: OSError) -> str:

@@ -13,7 +13,7 @@ import click
 
 from eschorty_ros.cli.console import of_total, pairs, progress_bar, show, table, warn
 from eschorty_ros.cli.files import OUT_FILE, check_output, is_yaml, report_replaced
-from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.cli.instrument import nodes_module
 from eschorty_ros.cli.options import Number, refuse_given
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.optics import SHIPPED
@@ -378,7 +378,7 @@ def _calibrate_simulated(
     from eschorty_ros.core.optics import load_calibration
 
     design, built = load_calibration(nominal), load_calibration(as_built)
-    with ended_by_signals(), temporary_folder() as folder:
+    with temporary_folder() as folder:
         job = one_calibration.CalibrationJob(
             tuple(known), str(folder), calibration=nominal, as_built=as_built, method=method
         )

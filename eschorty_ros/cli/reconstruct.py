@@ -16,7 +16,6 @@ from eschorty_ros.cli.cluster import on_cluster
 from eschorty_ros.cli.console import accuracy_rows, of_total, pairs, progress_bar, warn
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
-from eschorty_ros.cli.instrument import ended_by_signals
 from eschorty_ros.cli.options import Integer, Number, recorded_options, refuse_given, stated
 from eschorty_ros.core.base.errors import EschortyError
 
@@ -204,12 +203,11 @@ def _here(
     task: Callable[[Path, Path], Any], calls: list[tuple[Path, Path]]
 ) -> Iterator[tuple[int, Any]]:
     """Yield the index and the result of each call of ``task``, or its error."""
-    with ended_by_signals():
-        for index, call in enumerate(calls):
-            try:
-                yield index, task(*call)
-            except (EschortyError, OSError) as error:
-                yield index, error
+    for index, call in enumerate(calls):
+        try:
+            yield index, task(*call)
+        except (EschortyError, OSError) as error:
+            yield index, error
 
 
 def reconstruct_to(

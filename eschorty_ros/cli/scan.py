@@ -12,7 +12,7 @@ import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, report_replaced
-from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.cli.instrument import nodes_module
 from eschorty_ros.cli.options import (
     Integer,
     check_sweep,
@@ -131,7 +131,7 @@ def command(
         load_viser()
         open_when_served(host, port)
         click.echo(f"page at {page_url(host, port)}", err=True)
-    with _made(out, record), ended_by_signals(), progress_bar("scanning") as feedback:
+    with _made(out, record), progress_bar("scanning") as feedback:
         out.mkdir(parents=True, exist_ok=True)
         check_writable(out / "scan.pcd")
         if record is not None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
-from eschorty_ros.cli.instrument import ended_by_signals
 from eschorty_ros.cli.options import Number, check_sweep, sweep_options
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import remove_abandoned
@@ -67,7 +66,7 @@ def command(
     moved = {}
     if isinstance(shown, WithinRange):
         moved["ranges"] = f"{round(shown.offset_mm, 1) + 0.0} mm + {shown.factor:.5f} x the scene's"
-    with ended_by_signals(), progress_bar("simulating") as report:
+    with progress_bar("simulating") as report:
         recording = simulate_recording(
             out,
             shown,

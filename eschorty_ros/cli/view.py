@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ import click
 
 from eschorty_ros.cli.console import progress_bar, warn
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, check_picture
-from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.cli.instrument import nodes_module
 from eschorty_ros.cli.options import page_options, refuse_given
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
 
@@ -141,16 +142,15 @@ def serve_cloud(points: Points, host: str, port: int) -> None:
     shown = GrowingCloud()
     page = Page(shown, host=host, port=port)
     shown.add(points)
-    with ended_by_signals():
-        click.echo(f"page at {page.url} (Ctrl-C ends it)")
-        try:
-            while True:
-                page.show(points_text)
-                time.sleep(_SHOW_S)
-        except KeyboardInterrupt:
-            return
-        finally:
-            page.stop()
+    click.echo(f"page at {page.url} (Ctrl-C ends it)")
+    try:
+        while True:
+            page.show(points_text)
+            time.sleep(_SHOW_S)
+    except KeyboardInterrupt:
+        return
+    finally:
+        page.stop()
 
 
 def _draw_growing(points: Points, own: bool, target: Path) -> None:
@@ -206,4 +206,7 @@ def _open_window(points: Points, title: str) -> None:
     open3d = load_open3d("--window")
     xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
     shape = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz))
+    # Its loop calls no handler of Python.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     open3d.visualization.draw_geometries([shape], window_name=title)

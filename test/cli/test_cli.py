@@ -27,9 +27,11 @@ from eschorty_ros.cli.console import pairs, progress_bar, table
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, load_recording, read_cloud, write_cloud
+from eschorty_ros.core.storage.raw_file import RawWriter
 from eschorty_ros.simulation.scenes import Plane
 
 ROOT = Path(__file__).resolve().parents[2]
+ENDINGS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 NO_ROS = """
 import sys
 class Blocked:
@@ -260,7 +262,7 @@ def test_an_empty_cloud_is_a_failure_and_replaces_nothing(recording, tmp_path):
 
 
 @pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ENDINGS)
 def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step, number):
     def interrupted(*_):
         assert list((tmp_path / "rec").rglob("events.raw"))
@@ -273,7 +275,7 @@ def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ENDINGS)
 def test_an_interrupted_reconstruction_leaves_nothing(monkeypatch, recording, tmp_path, number):
     def interrupted(*_):
         assert list(tmp_path.rglob("points"))
@@ -283,6 +285,37 @@ def test_an_interrupted_reconstruction_leaves_nothing(monkeypatch, recording, tm
     result = run("reconstruct", recording, "--out", tmp_path / "cloud.pcd")
     assert result.exit_code == 128 + number
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ENDINGS)
+def test_an_interrupted_conversion_leaves_no_half_recording(
+    monkeypatch, recording, tmp_path, number
+):
+    good("convert", recording, tmp_path / "bag")
+    write = RawWriter.write
+
+    def interrupted(writer, data):
+        write(writer, data)
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(RawWriter, "write", interrupted)
+    result = run("convert", tmp_path / "bag", tmp_path / "rec")
+    assert result.exit_code == 128 + number
+    assert not (tmp_path / "rec").exists()
+
+
+def test_a_command_goes_on_without_its_terminal_where_sighup_is_ignored(
+    monkeypatch, recording, tmp_path
+):
+    """As `nohup` starts it."""
+    monkeypatch.setattr(
+        "eschorty_ros.core.storage.write_cloud", lambda *_: signal.raise_signal(signal.SIGHUP)
+    )
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        good("reconstruct", recording, "--out", tmp_path / "cloud.pcd")
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_simulate_refuses_to_overwrite_a_recording(recording):

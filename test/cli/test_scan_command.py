@@ -98,7 +98,12 @@ def test_a_scan_records_into_a_new_folder_only(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "expected"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, 128 + signal.SIGTERM)]
+    ("number", "expected"),
+    [
+        (signal.SIGINT, INTERRUPTED),
+        (signal.SIGTERM, 128 + signal.SIGTERM),
+        (signal.SIGHUP, 128 + signal.SIGHUP),
+    ],
 )
 def test_a_signal_ends_the_scan_with_the_laser_off_and_no_traceback(tmp_path, number, expected):
     with LoggedCommand(tmp_path, "scan", "--speed", 2, "--out", tmp_path / "scan") as command:
