@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import byte_view
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.base.numbers import integer, short
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.evt3.cuts import triggers_of
@@ -46,6 +48,8 @@ _STAGE_EDGES_MAX = 1024
 class Reconstructor:
     """Bytes in, profiles out; the same points however the bytes are split.
 
+    One thread at a time calls it. After a call that Ctrl-C has interrupted it takes no more bytes.
+
     Parameters
     ----------
     calibration : Calibration
@@ -73,6 +77,8 @@ class Reconstructor:
     ArgumentError
         When the profile is longer than the 2.1 s that the time within it can count, or the sensor
         has more than 1023 rows.
+    EschortyError
+        By ``push``, ``push_to`` and ``flush`` where such a call has not ended.
 
     Examples
     --------
@@ -138,6 +144,7 @@ class Reconstructor:
         self._before_restart: list[Profiles] = []
         self._each: Callable[[Profiles], Any]
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._in_use = threading.Lock()
         self._begin(modulation)
 
     def push(self, data: bytes | bytearray | memoryview) -> Profiles:
@@ -161,26 +168,42 @@ class Reconstructor:
 
         Other threads go on with later bytes meanwhile.
         """
-        self._each = each
-        before, self._before_restart = self._before_restart, []
-        for profiles in before:
-            each(profiles)
-        words, begin = self._decoder.words(byte_view("data", data)), 0
-        if self._first_row:
-            words = window_words(words, self._first_row)
-        settled = False
-        while begin < words.size:
-            left = words[begin:]
-            tracks = self._jobs > 1 and self._periods.lock.tracks
-            if settled and tracks and left.size > 2 * PASS_WORDS:
-                begin += self._add_tracked(left)
-                settled = False
-            else:
-                read, settled = self._add(left)
-                begin += read
-        for rows in self._assembler.take():
-            self._hand_on(rows)
-        del self._each
+        with self._used():
+            self._each = each
+            before, self._before_restart = self._before_restart, []
+            for profiles in before:
+                each(profiles)
+            words, begin = self._decoder.words(byte_view("data", data)), 0
+            if self._first_row:
+                words = window_words(words, self._first_row)
+            settled = False
+            while begin < words.size:
+                left = words[begin:]
+                tracks = self._jobs > 1 and self._periods.lock.tracks
+                if settled and tracks and left.size > 2 * PASS_WORDS:
+                    begin += self._add_tracked(left)
+                    settled = False
+                else:
+                    read, settled = self._add(left)
+                    begin += read
+            for rows in self._assembler.take():
+                self._hand_on(rows)
+            del self._each
+
+    @contextmanager
+    def _used(self) -> Iterator[None]:
+        """Refuse a call before another one has ended; one that is interrupted never ends."""
+        if not self._in_use.acquire(blocking=False):
+            raise EschortyError(
+                "this reconstructor is in use by another thread, or a call of it was interrupted; "
+                "make another one"
+            )
+        try:
+            yield
+        except Exception:
+            self._in_use.release()
+            raise
+        self._in_use.release()
 
     def _add_tracked(self, words: NDArray[np.uint16]) -> int:
         """Track the phase over ``words``, then assemble them in windows; return the number read."""
@@ -234,10 +257,11 @@ class Reconstructor:
 
         Without any phase until here there are none, and ``phase_missing`` is set.
         """
-        left, self._before_restart = self._before_restart, []
-        self._periods.finish(self.newest_t_us)
-        left += map(self._finished, self._assembler.take())
-        left.append(self._with_ranges(self._compensated(LineRows.empty(), last=True)))
+        with self._used():
+            left, self._before_restart = self._before_restart, []
+            self._periods.finish(self.newest_t_us)
+            left += map(self._finished, self._assembler.take())
+            left.append(self._with_ranges(self._compensated(LineRows.empty(), last=True)))
         return Profiles.concatenate(left)
 
     def _hand_on(self, rows: LineRows) -> None:

@@ -1,9 +1,16 @@
-"""Ctrl-C at any moment of a reconstruction is an exception, with which the laser goes off."""
+"""Ctrl-C at any moment of a reconstruction is an exception; a second thread is refused."""
 
 import subprocess
 import sys
+import threading
 
+import numpy as np
 import pytest
+from line_events import encoded, line_events
+from reconstructing import CALIBRATION, KNOWN
+
+from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.reconstruction import Reconstructor
 
 SCRIPT = """
 import random, signal, sys, time
@@ -52,3 +59,50 @@ def test_an_interrupt_at_any_moment_is_an_exception(jobs):
     done = subprocess.run([sys.executable, "-c", SCRIPT, str(jobs)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 50
+
+
+@pytest.fixture(scope="module")
+def data():
+    def flat(k, c):
+        return np.full(c.shape, 350.0)
+
+    return encoded(line_events(np.random.default_rng(3), flat, periods=12))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_reconstructor_takes_no_bytes_after_an_interrupted_call(data, jobs):
+    reconstructor = Reconstructor(CALIBRATION, KNOWN, jobs=jobs)
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstructor.push_to(interrupt, data)
+    for call in (lambda: reconstructor.push(data), reconstructor.flush):
+        with pytest.raises(EschortyError, match="interrupted; make another"):
+            call()
+
+
+def test_a_second_thread_is_refused_while_one_pushes(data):
+    reconstructor, refused = Reconstructor(CALIBRATION, KNOWN), []
+
+    def push():
+        with pytest.raises(EschortyError, match="another thread"):
+            reconstructor.push(data)
+        refused.append(True)
+
+    def meanwhile(_):
+        thread = threading.Thread(target=push)
+        thread.start()
+        thread.join()
+
+    reconstructor.push_to(meanwhile, data)
+    assert refused
+    assert len(reconstructor.flush())
+
+
+def test_bytes_that_are_refused_leave_a_reconstructor_as_it_is(data):
+    reconstructor, other = (Reconstructor(CALIBRATION, KNOWN) for _ in range(2))
+    with pytest.raises(EschortyError, match="data"):
+        reconstructor.push("events")
+    assert len(reconstructor.push(data)) == len(other.push(data)) > 0
