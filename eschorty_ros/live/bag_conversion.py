@@ -75,7 +75,7 @@ def bag_to_recording(
     - ``packet_period_s``: Time over which the camera collects events before it sends them.
 
     Raises ``FormatError`` or ``ArgumentError`` or ``CalibrationError`` when the bag cannot be read
-    or lacks something.
+    or lacks something, or the recording cannot be written.
     """
     path = file_path("bag", bag)
     with BagReader(path) as source:
@@ -104,14 +104,17 @@ def bag_to_recording(
             _play(source, stream, recorder, kinds)
             if not stream.packets:
                 raise FormatError(f"{path} has no packet with a laser state; give --frequency")
+            recorder.end(None)
+            lacking = recorder.wait(_DISK_S)
+            if recorder.failure:
+                raise FormatError(recorder.failure)
         except BaseException:
             recorder.end(None)
             recorder.wait(_DISK_S)
             # Half a recording would look complete.
             shutil.rmtree(target, ignore_errors=True)
             raise
-    recorder.end(None)
-    return recorder.wait(_DISK_S)
+    return lacking
 
 
 def _check(source: BagReader, calibration: Calibration | None, frequency_hz: float | None) -> None:

@@ -44,6 +44,9 @@ class ScanRecorder:
     - ``settings``: Settings of the reconstruction.
     - ``queue_bytes``: Most bytes of packets that wait for the disk.
     - ``waits``: Whether ``packet`` waits for the disk instead of leaving packets out.
+
+    Public attributes:
+    - ``failure``: The first thing that could not be written and why, ``""`` for nothing.
     """
 
     def __init__(
@@ -72,7 +75,7 @@ class ScanRecorder:
         # Of the recorder's thread.
         self._writer: RecordingWriter | None = None
         self._unwritten = 0
-        self._failure = ""
+        self.failure = ""
         # A disk that hangs must not keep the process from its end.
         threading.Thread(target=self._work, name="recorder", daemon=True).start()
 
@@ -84,13 +87,13 @@ class ScanRecorder:
         if not self._made.wait(timeout_s):
             self.end(None)
             return f"cannot record into {self.folder}: the disk does not answer"
-        return self._failure
+        return self.failure
 
     def wait(self, timeout_s: float) -> str:
         """Wait for the end; return what the recording lacks, ``""`` for nothing."""
         if not self._ended.wait(timeout_s):
             return f"the recording {self.folder} is still being written"
-        faults = "; ".join(self._log.faults) or self._failure
+        faults = "; ".join(self._log.faults) or self.failure
         return faults and f"recording {self.folder}: {faults}"
 
     # Called by the reconstruction's thread.
@@ -171,7 +174,7 @@ class ScanRecorder:
     def _work(self) -> None:
         with self._noted():
             make_recording_folder(self.folder)
-        if self._failure:
+        if self.failure:
             self._ended.set()
         self._made.set()
         while not self._ended.is_set():
@@ -192,10 +195,10 @@ class ScanRecorder:
         try:
             yield
         except EschortyError as error:
-            self._failure = self._failure or str(error)
+            self.failure = self.failure or str(error)
         except Exception as error:
             # A caller that waits for the disk would never return.
-            self._failure = self._failure or repr(error)
+            self.failure = self.failure or repr(error)
 
     def _begin(self) -> None:
         assert self._modulation is not None
@@ -204,7 +207,7 @@ class ScanRecorder:
         )
 
     def _write_packet(self, data: Any, missing: int, laser_on: bool) -> None:
-        if self._failure or self._writer is None:
+        if self.failure or self._writer is None:
             self._unwritten += 1
             return
         try:
@@ -229,13 +232,13 @@ class ScanRecorder:
             state="ended",
             packets_lost=self._lost,
             packets_left_out=left_out,
-            reason=reason or self._failure or self._stream_ended or slow or None,
+            reason=reason or self.failure or self._stream_ended or slow or None,
         )
         try:
             if writer is None:
                 with contextlib.suppress(OSError):
                     self.folder.rmdir()
-                self._failure = self._failure or "no packet came"
+                self.failure = self.failure or "no packet came"
                 return
             with self._noted():
                 newest = np.maximum.accumulate(samples["t_us"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import resource
 import shutil
 import sqlite3
 from copy import deepcopy
@@ -97,6 +98,19 @@ def test_a_disk_that_is_full_at_the_end_leaves_no_bag(tmp_path, source, monkeypa
     with pytest.raises(EschortyError, match="no space"):
         recording_to_bag(source, tmp_path / "bag")
     assert not (tmp_path / "bag").exists()
+
+
+def test_a_disk_that_is_full_leaves_no_recording(tmp_path, source):
+    recording_to_bag(source, tmp_path / "bag")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Python ignores the signal, and the write fails as on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (source.events_path.stat().st_size // 2, before[1]))
+    try:
+        with pytest.raises(EschortyError, match="File too large; free some space"):
+            bag_to_recording(tmp_path / "bag", tmp_path / "again")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not (tmp_path / "again").exists()
 
 
 def test_a_stage_in_unix_time_gives_no_bag(tmp_path, source):
