@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -63,6 +64,7 @@ class LazyGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an error of the package becomes one line, a signal 128 and its number."""
+        _open_closed_streams()
         # A terminal without a degree sign gets a question mark.
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
@@ -77,9 +79,21 @@ class LazyGroup(click.Group):
             raise
         except OSError as error:
             raise StatedFailure(_unusable(error)) from error
+        except MemoryError as error:
+            raise StatedFailure(f"not enough memory: {error}; end other programs") from error
         except KeyboardInterrupt:
             click.echo("eschorty: interrupted", err=True)
             ctx.exit(INTERRUPTED)
+
+
+def _open_closed_streams() -> None:
+    """Open streams that the process was started without, as by ``>&-``: what is printed is dropped.
+
+    Else files of the command would take their numbers, and what libraries print.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - the process's
 
 
 @contextlib.contextmanager

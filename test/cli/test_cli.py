@@ -170,6 +170,25 @@ def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
     assert str(error.strerror) in result.stderr
 
 
+def test_too_little_memory_is_one_line(monkeypatch, cloud):
+    def refuse(_path, **_):
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr("eschorty_ros.core.storage.cloud.stored_points", refuse)
+    assert_fails_in_one_line(run("info", cloud), "not enough memory: Unable to allocate 9 GiB; end")
+
+
+@pytest.mark.parametrize("closed", ["0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"])
+def test_a_command_without_standard_streams_does_its_work(recording, tmp_path, closed):
+    out = tmp_path / "cloud.pcd"
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", NO_ROS, "reconstruct",
+         recording, "--out", out], cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert len(read_cloud(out)) > 1000
+
+
 def test_an_unwritable_output_is_refused_before_the_work(monkeypatch, recording, tmp_path):
     def work(*_arguments):
         raise AssertionError("hours of work before the refusal")
