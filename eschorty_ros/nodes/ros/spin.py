@@ -62,7 +62,9 @@ def make_safe(nodes: Sequence[Node]) -> None:
         try:
             safe_state()
         except Exception as error:
-            print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
+            # A terminal that is gone must not keep the other nodes from it.
+            with contextlib.suppress(OSError):
+                print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
 
 
 def ends(node: Node) -> bool:

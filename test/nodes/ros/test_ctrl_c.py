@@ -1,6 +1,8 @@
 """Ctrl-C with both cores busy: every node ends quickly and silently, alone or with the others."""
 
 import contextlib
+import errno
+import io
 import os
 import signal
 import subprocess
@@ -23,8 +25,10 @@ from ros_process import (
 from std_msgs.msg import Header
 from waiting import wait_until
 
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.spin import make_safe
 
 # Runs a node's ``main`` and prints the threads of DDS that are left.
 ENDED = """
@@ -125,6 +129,26 @@ def test_all_nodes_in_one_process_scan_and_end(tmp_path: Path) -> None:
             with scenarios.bench(domain, log) as bench:
                 scenarios.full_scan(bench)
             assert_ctrl_c_ends({"instrument": process})
+
+
+def test_a_terminal_that_is_gone_keeps_no_node_from_its_safe_state(monkeypatch) -> None:
+    class Gone(io.StringIO):
+        def write(self, _: str) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    class Unsafe:
+        def get_name(self) -> str:
+            return "camera"
+
+        def safe_state(self) -> None:
+            asked.append(self)
+            raise DeviceError("no answer")
+
+    asked: list[Unsafe] = []
+    nodes = [Unsafe(), Unsafe()]
+    monkeypatch.setattr(sys, "stderr", Gone())
+    make_safe(nodes)
+    assert asked == nodes
 
 
 def test_a_signal_with_a_handler_of_its_own_costs_nothing() -> None:
