@@ -106,6 +106,8 @@ class RawReader:
         """Iterate over the words' bytes as `chunks` does, without copies: views of a memory map.
 
         The pages of a view are given back to the system when the next one is asked for.
+
+        Raises ``FormatError`` when the file has become shorter meanwhile.
         """
         integer("size", size, mmap.PAGESIZE, 1 << 40)
         first = self.header.size_bytes
@@ -115,6 +117,9 @@ class RawReader:
                 return
             pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         for begin in range(first, end, size):
+            # The process would end at a page that is gone.
+            if pages.size() < end:
+                raise FormatError(f"{self.path} became shorter while it was read; read it again")
             yield memoryview(pages)[begin : begin + size]
             page = begin - begin % mmap.PAGESIZE
             pages.madvise(mmap.MADV_DONTNEED, page, min(begin + size, end) - page)

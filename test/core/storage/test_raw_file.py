@@ -1,5 +1,6 @@
 """RAW files: old and new headers, damage that is named, files written for every reader."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,16 @@ def test_a_mapped_file_gives_the_same_bytes(tmp_path: Path) -> None:
     assert b"".join(pieces) == WORDS * 5000 + b"?"
     assert "middle of a word" in reader.warnings[0]
     assert list(reader_of(tmp_path, NEW).mapped(4096)) == []
+
+
+def test_a_mapped_file_that_becomes_shorter_is_named(tmp_path: Path) -> None:
+    """Its pages that are gone would end the process."""
+    reader = reader_of(tmp_path, NEW + WORDS * 2048)
+    pieces = reader.mapped(4096)
+    next(pieces)
+    os.truncate(reader.path, 5000)
+    with pytest.raises(FormatError, match=r"events\.raw became shorter while it was read"):
+        next(pieces)
 
 
 def test_odd_byte_is_a_warning(tmp_path: Path) -> None:
