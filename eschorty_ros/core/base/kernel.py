@@ -11,7 +11,9 @@ from __future__ import annotations
 import builtins
 import dis
 import hashlib
+import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
@@ -19,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numpy.typing import NDArray
 
@@ -54,7 +57,15 @@ def kernel(*function: Any, **options: Any) -> Any:
     return _compiled(_Inner, function[0], (), options)
 
 
-class _Entry(CPUDispatcher):
+class _Kernel(CPUDispatcher):
+    """A compiled function; Ctrl-C while it is compiled is an exception."""
+
+    def compile(self, signature: Any) -> Any:
+        with global_compiler_lock, _interruptible():
+            return super().compile(signature)
+
+
+class _Entry(_Kernel):
     """A compiled function that Python calls, and that returns no named tuple.
 
     numba runs Python to make one. Where that is interrupted, as by Ctrl-C, the process crashes.
@@ -68,6 +79,30 @@ class _Entry(CPUDispatcher):
         return compiled
 
 
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise after the block what interrupted a callback of LLVM in it.
+
+    Ctrl-C while LLVM works is noticed there; ctypes drops it, and numba fails at what is missing.
+    """
+    dropped: list[BaseException] = []
+    before = sys.unraisablehook
+
+    def note(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+            dropped.append(unraisable.exc_value)
+        else:
+            before(unraisable)
+
+    sys.unraisablehook = note
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+        if dropped:
+            raise dropped[0] from None
+
+
 def _is_named(result: types.Type) -> bool:
     """Return whether a type is a named tuple, or a tuple with one in it."""
     if not isinstance(result, types.BaseTuple):
@@ -75,7 +110,7 @@ def _is_named(result: types.Type) -> bool:
     return isinstance(result, types.BaseNamedTuple) or any(map(_is_named, result))
 
 
-class _Inner(CPUDispatcher):
+class _Inner(_Kernel):
     """A compiled function without code for calls from Python, which would crash."""
 
     def __call__(self, *_arguments: Any) -> Any:

@@ -25,6 +25,25 @@ def _total(x):
 
 print(_total(1))
 """
+INTERRUPTED = """
+from llvmlite.binding import executionengine
+from eschorty_ros.core.base.kernel import entry_kernel
+
+@entry_kernel
+def _doubled(x):
+    return 2 * x
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+string_at, executionengine.string_at = executionengine.string_at, interrupt
+try:
+    _doubled(1)
+except KeyboardInterrupt:
+    print("interrupted")
+executionengine.string_at = string_at
+print(_doubled(1))
+"""
 
 
 def output(tmp_path, *command):
@@ -189,3 +208,9 @@ except TypeError as error:
     for result, words in results.items():
         (tmp_path / "pairs.py").write_text(code.format(result=result))
         assert words in output(tmp_path, str(tmp_path / "pairs.py"))
+
+
+def test_ctrl_c_while_a_kernel_is_compiled_is_an_exception(tmp_path):
+    """In the callback by which LLVM hands over its code."""
+    (tmp_path / "interrupted.py").write_text(INTERRUPTED)
+    assert output(tmp_path, str(tmp_path / "interrupted.py")) == "interrupted\n2\n"
