@@ -451,11 +451,10 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
             block = c // BLOCK_COLUMNS + 1
             sigma2[k, c] += history.moved2[block]
             rows.mixed[k, c] = False
-            events = rows.events[k, c]
-            weak = few <= events < smoothing.isolation_events
-            if np.isnan(width) or rows.truncated[k, c] or weak:
+            if np.isnan(width) or rows.truncated[k, c]:
                 widths.same_width[k, c] = np.nan
                 continue
+            events = rows.events[k, c]
             if events < few:
                 # The width of few events scatters by more than those of most lines.
                 sigma_few = max(sigma, usual / np.sqrt(2.0 * WIDTH_COLUMNS * max(events, 1)))
@@ -468,7 +467,10 @@ def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
                 reach = _reach(averaged, sigma)
             moves = displacement * displacement > STEADY**2 * row2
             edge2, weight = _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves)
-            if not abs(width - last[k, c]) > STEADY * sigma:
+            if events < smoothing.isolation_events:
+                # It shows no width that others have.
+                widths.same_width[k, c] = np.nan
+            elif not abs(width - last[k, c]) > STEADY * sigma:
                 widths.usual.number[_width_bin(width)] += weight
             rows.mixed[k, c] = edge2 > limit2
             passing2 = _passing_variance(widths, history.passing2[block], k, c, sigma)

@@ -158,6 +158,28 @@ def test_lines_that_appear_and_vanish_are_flagged(speed_px, pitch, least, most, 
     assert within.mean() > covered
 
 
+def test_an_edge_on_a_line_of_few_events_is_flagged():
+    """All points have about as many events as an isolated one has to have a neighbour for."""
+    camera = Camera(periods=60, contrast=0.8, threshold=0.5, mismatch=0.2, events_max=1)
+    passes = 40
+
+    def part(k, _):
+        return -ROWS, 24.0 - 4.0 * max(k - passes, -ROWS)
+
+    found, _ = reconstruct(
+        stream(camera.line(lambda _, column: np.full(column.shape, ROW), part=part))
+    )
+    bad, flagged = np.abs(found.row - ROW) > 1.5, found.flags > 0
+    before = found.period < passes
+    print(
+        f"{found.events[before].mean():.1f} events; flagged: {flagged[bad].mean():.3f} of "
+        f"{bad.sum()} wrong points, {flagged[before].mean():.4f} before, seed {camera.seed}"
+    )
+    # 0.22 where points with fewer than isolation_events are not tested.
+    assert flagged[bad].mean() > 0.9
+    assert flagged[before].mean() < 0.01
+
+
 @pytest.mark.parametrize("step_px", [-0.5, 0.5], ids=["wider", "narrower"])
 def test_sigma_holds_what_an_edge_too_small_for_a_flag_moves(step_px):
     """A step of half a row passes from one end of the line to the other in 20 profiles."""
