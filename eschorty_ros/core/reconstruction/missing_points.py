@@ -57,7 +57,7 @@ def missing_points(
         _cut(counts),
         _too_wide(counts, settings),
         few or ("" if faulty else _weak(counts, settings, modulation, periods_per_profile)),
-        _long_profiles(settings, modulation, periods_per_profile),
+        _long_profiles(counts, settings, modulation, periods_per_profile),
     )
     return [reason for reason in reasons if reason]
 
@@ -178,13 +178,25 @@ def _weak(
     )
 
 
-def _long_profiles(settings: Settings, modulation: Modulation, periods_per_profile: int) -> str:
+def _long_profiles(
+    counts: Mapping[str, int],
+    settings: Settings,
+    modulation: Modulation,
+    periods_per_profile: int,
+) -> str:
     if settings.periods_per_profile != 0 or periods_per_profile <= 1:
         return ""
+    events = counts["events_used"] / max(_points_of_any_range(counts), 1)
+    enough = math.ceil(periods_per_profile * EVENTS_WANTED / max(events, 1.0))
+    shorter = (
+        f"; points have {events:.0f} events: where the recording begins in the dark or on a dark "
+        f"surface set periods_per_profile to about {enough}"
+    )
     return (
         "a column has too few events for a point in one period, or others in the next; "
         f"{periods_per_profile} periods make a profile, "
         f"{modulation.frequency_hz / periods_per_profile:.4g} profiles per second"
+        f"{shorter if 2 * enough <= periods_per_profile else ''}"
     )
 
 

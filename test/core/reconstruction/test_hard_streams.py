@@ -847,6 +847,22 @@ def test_a_surface_that_begins_or_ends_leaves_a_profile_one_period(growth):
     assert reconstructor.periods_per_profile == 1, f"seed {camera.seed}"
 
 
+@pytest.mark.parametrize(("brighter_from", "warned"), [(100, True), (200, False)])
+def test_profiles_too_long_for_what_follows_a_dark_surface_have_a_warning(brighter_from, warned):
+    camera = Camera(frequency_hz=1000.0, periods=200, contrast=6.0, threshold=0.5, events_max=2)
+
+    def line(first, end, power):
+        return camera.line(
+            lambda k, column: np.where((first <= k < end) & (column < 320), 340.3, np.nan), power
+        )
+
+    dark, bright = line(0, brighter_from, 0.1), line(brighter_from, camera.periods, 1.0)
+    _, reconstructor = points(camera, dark, bright, periods_per_profile=0)
+    assert reconstructor.periods_per_profile == 4, f"seed {camera.seed}"
+    (warning,) = reconstructor.warnings
+    assert ("set periods_per_profile to about 1" in warning) == warned
+
+
 def _sloping(towards: float):
     return lambda k, c: np.abs(towards - 3.0 - 0.06 * c) + 0.0 * k
 
