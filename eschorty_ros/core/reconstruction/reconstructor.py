@@ -137,7 +137,7 @@ class Reconstructor:
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_found=0, points_beyond_pole=0,
             points_outside_roi=0, points_flagged=0, points_cut=0, events_used=0,
-            columns_compensated=0,
+            columns_compensated=0, periods_with_points=0,
         )  # fmt: skip
         self._watermark_us = 0
         self._periods_before = 0
@@ -350,6 +350,8 @@ class Reconstructor:
             self._counts["points_beyond_pole"] += len(rows) - len(profiles)
         if self._first_row:
             profiles = replace(profiles, row=profiles.row + self._first_row)
+        periods = profiles.profile_count * self._periods.lock.schedule.every
+        self._counts["periods_with_points"] += periods
         within = within_ranges(profiles.range_mm, self.settings)
         self._counts["events_used"] += int(profiles.events.sum())
         if not within.all():
@@ -473,7 +475,8 @@ class Reconstructor:
         laser. ``events_used`` are those of the points, of any range.
         ``points_flagged`` are some of ``points_found`` within the limits, which are the ``points``
         unless ``keep`` is good; ``points_cut``, by the sensor's edge, are some of those.
-        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words``,
+        ``periods_closed`` had events, ``periods_empty`` none; ``periods_with_points`` are those of
+        profiles with points of any range. ``sensor_drop_words``,
         ``broken_words`` and ``decoder_*`` come from the decoder.
         """
         counts = Counter(self._counts)

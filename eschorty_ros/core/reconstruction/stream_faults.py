@@ -49,10 +49,12 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         )
     if is_unreadable(counts):
         return found
-    used, bridged = counts["triggers_used"], counts["edges_bridged"]
+    used = counts["triggers_used"]
     edges = used + counts["triggers_spurious"]
+    # A laser that is off sends none.
+    bridged = min(counts["edges_bridged"], max(counts["periods_with_points"] - used, 0))
     if max(bridged, edges - used) > used:
-        without = f" and {bridged} periods begin without one" if bridged else ""
+        without = f" and {bridged} periods with points begin without one" if bridged else ""
         found.append(
             f"{used} of {edges} edges at the trigger input begin a period{without}; where they are "
             "not the laser's, set trigger_source to what the input is wired to, or to none"

@@ -428,6 +428,19 @@ def test_edges_on_the_trigger_input_that_are_not_the_lasers_have_a_warning(edges
     assert any(words in warning for warning in reconstructor.warnings)
 
 
+@pytest.mark.parametrize(
+    ("lit", "triggers", "words"),
+    [(10, 10, []), (30, 10, ["10 of 10 edges at the trigger input", "20 periods with points"])],
+)
+def test_triggers_that_end_with_the_light_are_no_fault(lit, triggers, words):
+    rows = lines(lambda k, c: np.where(k < lit, 350.0, np.nan), periods=40)
+    edges = 1000 + np.rint(np.arange(triggers) * 1e6 / 70).astype(int)
+    found, reconstructor = reconstruct(encoded(rows, edges), Modulation(70.0))
+    assert found.profile_count == lit
+    assert len(reconstructor.warnings) == bool(words)
+    assert all(word in reconstructor.warnings[0] for word in words)
+
+
 def test_phase_is_estimated_and_nothing_is_lost():
     found, reconstructor = reconstruct(encoded(lines(periods=8, edge_us=9000)), Modulation(70.0))
     assert not reconstructor.phase_missing
