@@ -67,11 +67,13 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
             f"after that; where these were scanned, too, {name} is cut: copy it again"
         )
     before = position_mm[: np.searchsorted(t_us, begin_us - _LEFT_US)]
-    if (scan := recording.scan) is not None:
-        # The stage has run up to the sweep before its events.
-        before = before[between(before, scan.start_mm, scan.stop_mm)]
     around = position_mm[slice(*np.searchsorted(t_us, (begin_us - _LEFT_US, begin_us + _LEFT_US)))]
     under_way = around.size > 1 and np.ptp(around) > _REST_MM
+    if (scan := recording.scan) is not None:
+        # Earlier sweeps, and the way to where it begins, outside start to stop, come before it.
+        before = before[between(before, scan.start_mm, scan.stop_mm)]
+        first = np.searchsorted(t_us, begin_us)
+        under_way &= between(position_mm[first : first + 1], scan.start_mm, scan.stop_mm).all()
     if before.size and np.ptp(before) > least_mm and under_way:
         found.append(
             f"the events begin at {begin_us * 1e-6:.3f} s, and the stage has moved "

@@ -266,6 +266,18 @@ def test_a_stage_that_rests_turns_or_is_coarse_does_not_jump(recording, position
     assert not [line for line in faults if "jumps" in line]
 
 
+@pytest.mark.parametrize(("first", "missing"), [(120, False), (150, False), (180, True)])
+def test_what_the_stage_did_before_a_scan_is_no_missing_beginning(recording, first, missing):
+    earlier_mm, own_mm = FORTH_MM, np.linspace(5.0, 40.0, 60)
+    position_mm = np.concatenate([earlier_mm, own_mm[::-1], np.full(30, 5.0), own_mm])
+    samples = np.empty(position_mm.size, recording.stage_samples.dtype)
+    samples["t_us"], samples["position_mm"] = np.arange(position_mm.size) * 10_000, position_mm
+    scan = ScanLog(scan_id="s", state="ended", start_mm=10.0, stop_mm=40.0)
+    scanned = replace(recording, stage_samples=samples, scan=scan)
+    faults = stage_faults(scanned, (int(samples["t_us"][first]), int(samples["t_us"][-1])))
+    assert any("the stage has moved" in line for line in faults) == missing
+
+
 def test_words_that_are_none_have_one_reason(recording):
     """Counts of a stream that cannot be read are not explained one by one."""
     lines = reconstruct_recording(with_broken_words(recording)).warnings
