@@ -226,9 +226,9 @@ def few_points(
         words, count = _FILTERED, counters["events_filtered"]
     else:
         words, count = _LOSSES[lost], counters[lost]
-        unused = counters["events_binned"] - float(points["intensity"].sum())
+        unused = counters["events_binned"] - counters["events_used"]
         # Background alone leaves columns with few events, too.
-        if len(points) and unused < Settings().events_min * count:
+        if len(points) and lost in _WITHOUT_POINT and unused < Settings().events_min * count:
             return []
     if len(points) and count <= _FEW * len(points):
         return []

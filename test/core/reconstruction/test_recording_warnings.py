@@ -278,6 +278,17 @@ def test_what_the_stage_did_before_a_scan_is_no_missing_beginning(recording, fir
     assert any("the stage has moved" in line for line in faults) == missing
 
 
+def test_more_light_outside_the_scan_than_in_it_is_no_lack_of_events(recording):
+    scan = ScanLog(scan_id="s", state="ended", start_mm=10.0, stop_mm=12.0)
+    t_us, column = np.meshgrid(1_000_000 + 14_286 * np.arange(200), np.arange(96), indexing="ij")
+    dark = Encoder().encode(t_us.ravel(), column.ravel(), *np.zeros((2, t_us.size), int))
+    path = recording.path.parent / "dark.raw"
+    path.write_bytes(recording.events_path.read_bytes() + dark)
+    result = reconstruct_recording(replace(recording, events_path=path, scan=scan))
+    assert len(result.points) > 0
+    assert not any("fewer events" in line for line in result.warnings), result.warnings
+
+
 def test_words_that_are_none_have_one_reason(recording):
     """Counts of a stream that cannot be read are not explained one by one."""
     lines = reconstruct_recording(with_broken_words(recording)).warnings
