@@ -123,11 +123,14 @@ class PacedWaiting:
         """Give feedback, check the reasons to end, sleep for one tick."""
         if self._ended.is_set() or not self._running():
             raise ScanFailure(f"{self._name}: the node was shut down")
-        now_s = time.monotonic()
-        stall_s, self._tick_s = now_s - self._tick_s, now_s
         self._feedback(self._phase)
         if self._watching:
-            self._check_light(stall_s)
+            self.check(
+                self.monitor.check_laser,
+                self.monitor.check_reconstruction,
+                lambda: self.monitor.check_progress(self._events_timeout_s),
+            )
+        self._tick_s = time.monotonic()
         if not self._shielded:
             # One that has failed gives no light until it is configured again.
             self.monitor.check_laser_works()
@@ -135,12 +138,15 @@ class PacedWaiting:
                 raise ScanCanceled
         time.sleep(_TICK_S)
 
-    def _check_light(self, stall_s: float) -> None:
-        """Raise ``ScanFailure`` without light or events; this process ran ``stall_s`` ago."""
+    def check(self, *checks: Callable[[], None]) -> None:
+        """Run checks of the other nodes; what fails after a stall of this process names the stall.
+
+        Each raises ``ScanFailure``.
+        """
+        stall_s = time.monotonic() - self._tick_s
         try:
-            self.monitor.check_laser()
-            self.monitor.check_reconstruction()
-            self.monitor.check_progress(self._events_timeout_s)
+            for check in checks:
+                check()
         except ScanFailure:
             if stall_s > _STALL_S:
                 raise ScanFailure(

@@ -225,8 +225,7 @@ class InstrumentClient(PacedWaiting):
         begun_s = time.monotonic()
         while not future.done():
             self.tick()
-            self.monitor.check_stage()
-            self.monitor.check_motion(begun_s)
+            self.check(self.monitor.check_stage, lambda: self.monitor.check_motion(begun_s))
         self._sent = None
         answer = future.result()
         if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:

@@ -1,5 +1,6 @@
 """The client of laser, stage and reconstruction while its goal is canceled."""
 
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -89,6 +90,22 @@ def test_a_refusal_of_the_stage_names_it_once():
     client._stage = SimpleNamespace(send_goal_async=lambda goal: Answered(handle, 0))
     client.monitor.update_stage(1, 10.0, 0.0, 0.0)
     with pytest.raises(ScanFailure, match=r"^stage: refused: node is inactive$"):
+        client.move(10.0, 5.0)
+
+
+def test_a_stall_of_the_scanner_in_a_move_is_not_taken_for_one_of_the_stage(monkeypatch):
+    client = CanceledClient(canceled=False)
+    never = SimpleNamespace(done=lambda: False)
+    handle = SimpleNamespace(accepted=True, get_result_async=lambda: never)
+    client._stage = SimpleNamespace(send_goal_async=lambda goal: Answered(handle, 0))
+    client.monitor.update_stage(1, 10.0, 0.0, 0.0)
+
+    def stalled(duration_s):
+        now_s = time.monotonic()
+        monkeypatch.setattr(time, "monotonic", lambda: now_s + 6.0)
+
+    monkeypatch.setattr(time, "sleep", stalled)
+    with pytest.raises(ScanFailure, match=r"scanner: its process did not run for 6\.0 s"):
         client.move(10.0, 5.0)
 
 
