@@ -33,7 +33,7 @@ from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings, settings_of
 from eschorty_ros.nodes.ros.peers import Publishers
-from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.spin import ends, run
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 # Every change and, with light, every read-back is published, too.
@@ -153,7 +153,8 @@ class LaserNode(DeviceNode):
     def stop_device(self) -> None:
         """Disable; an output that is not confirmed off is reported as unknown."""
         try:
-            self._supervisor.disable(self.failure or "not active")
+            ended = "its node was ended" if ends(self) else "not active"
+            self._supervisor.disable(self.failure or ended)
         except EschortyError as error:
             self._alarm(str(error))
 

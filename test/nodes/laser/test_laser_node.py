@@ -206,6 +206,8 @@ def test_repeated_signal_switches_off_and_exits_clean(
         assert bench.node.wait() == 0
         assert bench.awg.outputs() == ["OFF", "ON", "OFF"]
         assert "Traceback" not in bench.node.output
+        reason = "its node was ended"
+        wait_until(lambda: bench.states[-1].reason == reason, "the reason")
 
 
 @pytest.mark.parametrize(("name", "value"), [("driver", "quantum"), ("frequency", 5.0)])
