@@ -97,7 +97,8 @@ class PacedWaiting:
             self.monitor.check_progress(no_progress_s)
             elapsed_s = time.monotonic() - begun_s
             behind_ns = target_ns - self.monitor.until_ns
-            rest_s = elapsed_s * behind_ns / max(self.monitor.until_ns - begun_ns, 1)
+            advanced_ns = self.monitor.until_ns - begun_ns
+            rest_s = elapsed_s * behind_ns / advanced_ns if advanced_ns > 0 else 0.0
             if rest_s > within_s and elapsed_s > min(_PACE_KNOWN_S, within_s):
                 raise ScanFailure(
                     f"reconstruction: {behind_ns * 1e-9:.1f} s behind the end of the sweep, "

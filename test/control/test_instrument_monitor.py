@@ -81,6 +81,13 @@ def test_a_drain_ends_although_there_is_progress():
     assert time.monotonic() - begun_s < 5.0
 
 
+def test_a_drain_without_any_progress_has_no_pace():
+    waiting = PacedWaiting("scanner", monitor(), lambda: 10**18, lambda: True, 3.0)
+    waiting.prepare(lambda: False, lambda phase: None)
+    with pytest.raises(ScanFailure, match=r"camera: no events reach the reconstruction for 0\.3 s"):
+        waiting.drain(0.3, 0.1)
+
+
 def test_a_slow_drain_goes_on_while_the_rest_takes_no_longer_than_the_limit():
     subject = monitor()
     waiting = PacedWaiting("scanner", subject, lambda: 10**18, lambda: True, 3.0)
