@@ -25,6 +25,9 @@ def load_open3d(purpose: str) -> ModuleType:
     try:
         import open3d
     except (ImportError, OSError) as error:
+        # Compiled modules turn the exception of a signal into an ImportError.
+        if isinstance(error.__cause__, KeyboardInterrupt | SystemExit):
+            raise error.__cause__ from None
         absent = isinstance(error, ModuleNotFoundError)
         remedy = "pip install open3d libusb-package" if absent else f"apt install {_LIBRARIES}"
         raise EschortyError(

@@ -123,6 +123,16 @@ def test_a_mesh_without_a_library_that_open3d_links_names_its_package(tmp_path, 
         load_open3d("a mesh")
 
 
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, SystemExit])
+def test_a_signal_while_open3d_is_imported_ends_the_process(tmp_path, monkeypatch, ending):
+    text = f"raise ImportError('initialization failed') from {ending.__name__}(143)"
+    (tmp_path / "open3d.py").write_text(text)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ending, match="143"):
+        load_open3d("a mesh")
+
+
 @pytest.mark.usefixtures("open3d")
 def test_mesh_agrees_with_the_analytic_plane() -> None:
     from eschorty_ros.simulation.scenes import Mesh
