@@ -13,8 +13,8 @@ from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 KNOWN = Modulation(70.0, on_edge_us=1000)
 CALIBRATION = load_calibration("config_3")
 EVENTS_GO_TO = (
-    "events_binned", "events_over_column_limit", "events_outside_sensor", "events_outside_phase",
-    "events_filtered", "events_gated", "events_held", "events_outside_roi",
+    "events_binned", "events_over_column_limit", "events_outside_phase", "events_filtered",
+    "events_gated", "events_held", "events_outside_roi",
 )  # fmt: skip
 
 

@@ -71,17 +71,6 @@ class Bins(NamedTuple):
     floor_us: np.int64
 
 
-class Appended(NamedTuple):
-    """Index of the first event not read, and the number of events outside the sensor.
-
-    ``full`` when a column needs more room: then no event has been read.
-    """
-
-    next: np.int64
-    full: bool
-    outside: int
-
-
 def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
     """Return ``columns`` empty columns with ``room`` for events each, and ``limit`` at most."""
     room = min(room, limit)
@@ -206,27 +195,25 @@ def _bins(columns, part, keeps_late, edge_us, floor_us):
 
 
 @kernel
-def _append(events, first, limit_us, edge_us, columns, sensor_rows, gate):
-    """Append the events before ``limit_us`` to `empty_columns`, or count why not."""
+def _append(events, first, limit_us, edge_us, columns, gate):
+    """Append the events before ``limit_us`` to their columns, or count why not.
+
+    Returns the index of the first event not read, and whether a column needs more room: then no
+    event has been read.
+    """
     t, x, y, p = events
     before = columns.counts.copy()
     _clear_refused(columns.refused)
-    size = np.uintp(columns.seeds.size)
-    rows_end = np.uint32(sensor_rows)
     i = np.uintp(first)
     end = np.uintp(t.size)
-    outside = 0
     while i < end and t[i] < limit_us:
         part = _gate_part(max(t[i], edge_us), edge_us, gate)
         bins = _bins(columns, part, gate.keeps_late > 0, edge_us, edge_us)
         end_us = min(part.end_us, limit_us)
         while i < end and t[i] < end_us:
-            if np.uintp(x[i]) < size and np.uint32(y[i]) < rows_end:
-                _bin(bins, np.uint64(0), t[i], x[i], y[i], p[i])
-            else:
-                outside += 1
+            _bin(bins, np.uint64(0), t[i], x[i], y[i], p[i])
             i += np.uintp(1)
     if _needs_room(columns):
         columns.counts[:] = before
-        return Appended(np.int64(first), True, 0)
-    return Appended(np.int64(i), False, outside)
+        return np.int64(first), True
+    return np.int64(i), False

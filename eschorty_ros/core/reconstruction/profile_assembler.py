@@ -269,13 +269,12 @@ class ProfileAssembler:
 
 
 @kernel
-def _count(events, outside, refused, memory):
+def _count(events, refused, memory):
     """Count the events read of the open period."""
     state, counters = memory.state, memory.counters
     state.window += events
-    refusals = outside + refused.over_limit + refused.outside_region + refused.gated
+    refusals = refused.over_limit + refused.outside_region + refused.gated
     counters.events_binned += events - refusals
-    counters.events_outside_sensor += outside
     counters.events_over_column_limit += refused.over_limit
     counters.events_outside_roi += refused.outside_region
     counters.events_gated += refused.gated
@@ -293,12 +292,10 @@ def _fill(events, first, limit_us, memory):
         return i
     state.status = FILLED
     columns, gate = memory.columns, memory.gate.state
-    sensor_rows = memory.estimator.sensor_rows
-    appended = _append(events, first, limit_us, state.edge_us, columns, sensor_rows, gate)
-    state.full = appended.full
-    if not appended.full:
-        _count(appended.next - first, appended.outside, columns.refused, memory)
-    return appended.next
+    end, state.full = _append(events, first, limit_us, state.edge_us, columns, gate)
+    if not state.full:
+        _count(end - first, columns.refused, memory)
+    return end
 
 
 class _Open(NamedTuple):
@@ -422,7 +419,7 @@ def _pass(words, progress, decoder, span, edges, period, memory, before):
         i = end
         if events > 0:
             state.status = FILLED
-            _count(np.int64(events), 0, columns.refused, memory)
+            _count(np.int64(events), columns.refused, memory)
         if i == np.uint64(words.size) or words[i] >> 12 == EXT_TRIGGER:
             break
         if limit_us < end_us:

@@ -111,7 +111,6 @@ _FILLED = np.sqrt(HALF_PER_SIGMA / FRACTION / np.sqrt(3.0))
 COUNTERS = (
     "events_binned",
     "events_before_first_edge",
-    "events_outside_sensor",
     "events_outside_roi",
     "events_over_column_limit",
     "events_gated",
