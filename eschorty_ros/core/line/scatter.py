@@ -43,7 +43,7 @@ _DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
 # as large, a surface's shape 64 times.
 _TEXTURE_MAX = 4.0
 # Largest factor of a variance, and one over the least.
-FACTOR_MAX = 64.0
+_FACTOR_MAX = 64.0
 
 
 class Differences(NamedTuple):
@@ -55,24 +55,25 @@ class Differences(NamedTuple):
 
 
 class Scatter(NamedTuple):
-    """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
+    """Differences of rows, and ``near`` and ``far`` ones of smoothed rows.
 
-    Those of ``near`` and ``far`` are of smoothed rows. No difference shows what the ``levels`` do.
+    No difference shows what the ``levels`` do. Only the variances of ``windowed`` means are scaled:
+    those over full columns are as expected.
     """
 
     own: Differences
     near: Differences
     far: Differences
     levels: Levels
-    factor_max: float
+    windowed: bool
 
 
-def empty_scatter(columns: int, factor_max: float) -> Scatter:
+def empty_scatter(columns: int, windowed: bool) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     own, near, far = np.zeros((3, len(Differences._fields), blocks))
     return Scatter(
-        Differences(*own), Differences(*near), Differences(*far), empty_levels(blocks), factor_max
+        Differences(*own), Differences(*near), Differences(*far), empty_levels(blocks), windowed
     )
 
 
@@ -100,7 +101,7 @@ def _ratio(sums, block, least):
     if _near_sum(sums.number, block) < least:
         return -1.0
     expected = _WITHIN2 * _near_sum(sums.expected, block)
-    return min(max(_near_sum(sums.squares, block) / expected, 1.0 / FACTOR_MAX), FACTOR_MAX)
+    return min(max(_near_sum(sums.squares, block) / expected, 1.0 / _FACTOR_MAX), _FACTOR_MAX)
 
 
 @kernel(_nrt=False)
@@ -194,28 +195,23 @@ def _smoothed_ratio(scatter, block):
     """
     near = _ratio(scatter.near, block, _SMOOTHED_MIN)
     far = _ratio(scatter.far, block, _SMOOTHED_MIN)
-    if min(near, far) < 0.0 or scatter.factor_max == 0.0:
+    if min(near, far) < 0.0 or not scatter.windowed:
         return -1.0
     return min(far, max(near, (_TEXTURE_MAX * near) ** 2 / far))
 
 
 @kernel(_nrt=False)
 def _scale(rows, scatter, smoothing):
-    """Scale the variances of a profile by the scatter, and widen the smoothing gates by it.
-
-    With a ``factor_max`` of 0, for means over full columns, they are as expected.
-    """
+    """Scale the variances of a profile by the scatter, and widen the smoothing gates by it."""
     returns, columns = rows.row.shape
     sums = scatter.own
     _add_differences(rows.row[0], rows.sigma2[0], sums)
     for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, _DIFFERENCES_MIN)
-        measured = ratio >= 0.0 and scatter.factor_max > 0.0
+        ratio = _ratio(sums, block, _DIFFERENCES_MIN) if scatter.windowed else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
-        ratio = ratio if measured else 1.0
-        factor = min(ratio, scatter.factor_max) if measured else 1.0
         # Independent events scatter more than those of pixels, and bound what is not measured.
-        independent = 0.0 if measured or scatter.factor_max == 0.0 else 1.0
+        independent = 1.0 if ratio < 0.0 else 0.0
+        ratio = ratio if ratio >= 0.0 else 1.0
         for k in range(returns):
             for c in range(np.uintp(begin), np.uintp(end)):
                 sigma2, cut = rows.sigma2[k, c], rows.truncated[k, c]
@@ -223,7 +219,7 @@ def _scale(rows, scatter, smoothing):
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)
                 smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px
-                rows.sigma2[k, c] = factor * sigma2
+                rows.sigma2[k, c] = ratio * sigma2
 
 
 @kernel(_nrt=False)
@@ -264,7 +260,7 @@ def _scale_smoothed(rows, scatter, smoothing):
     _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _FAR_APART, far)
     for block in range(1, near.number.size - 1):
         ratio = _smoothed_ratio(scatter, block)
-        factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
+        factor = ratio if ratio >= 0.0 else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         for k in range(returns):
             middle, locking2 = np.uintp((begin + end) // 2), scatter.levels.variance[block]

@@ -62,7 +62,6 @@ from eschorty_ros.core.line.line_history import (
 )
 from eschorty_ros.core.line.pixel_locking import _measure_levels
 from eschorty_ros.core.line.scatter import (
-    FACTOR_MAX,
     Scatter,
     _clear_scatter,
     _scale,
@@ -227,7 +226,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
         known_widths=empty_usual_widths(model.columns),
-        scatter=empty_scatter(model.columns, FACTOR_MAX if windowed else 0.0),
+        scatter=empty_scatter(model.columns, windowed),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
             settings.smoothing_gate_px,
