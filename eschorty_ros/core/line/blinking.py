@@ -154,8 +154,7 @@ def _is_in_phase(sums, blink):
     Only from 16 events on, which background reaches less often than a vector strength of a half,
     and where a profile has one period.
     """
-    few = sums.events < 16 or 10 * sums.out_of_phase > sums.events
-    return not few and blink.lit_us > 0
+    return sums.events >= 16 and 10 * sums.out_of_phase <= sums.events and blink.lit_us > 0
 
 
 @kernel(_nrt=False)

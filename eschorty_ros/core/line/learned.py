@@ -162,7 +162,7 @@ def _sample(column, c, row, sensor_rows, footprint, counts):
     ``counts`` is zeroed scratch, one per row.
     """
     slot = c // _STRIDE
-    if (c - footprint.state.profiles) % _STRIDE != 0 or slot >= footprint.first_row.size:
+    if (c - footprint.state.profiles) % _STRIDE != 0:
         return
     begin = np.int64(np.rint(row)) - footprint.reach
     first, last = max(begin, 0), min(begin + 2 * footprint.reach, sensor_rows - 1)

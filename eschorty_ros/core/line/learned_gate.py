@@ -90,7 +90,7 @@ def same_gate(gate: LearnedGate) -> LearnedGate:
 
 def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
     states = [_state(one) for one in (gate, gate, *choices)]
-    return LearnedGate(states[0], states[1], np.array([*states[2:]], states[0].dtype))
+    return LearnedGate(states[0], states[1], np.array(states[2:], states[0].dtype))
 
 
 def _state(gate: PhaseGate) -> Any:

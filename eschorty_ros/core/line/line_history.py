@@ -308,8 +308,7 @@ def _compare_with_recent(history, known, usual, width_variance):
     alike = _move_alike(now, recent)
     for block in range(1, now.points.size - 1):
         points = _near_sum(now.points, block)
-        history.moved2[block], history.passing2[block] = 0.0, 0.0
-        history.step_px[block] = 0.0
+        history.moved2[block], history.passing2[block], history.step_px[block] = 0.0, 0.0, 0.0
         if points == 0.0 or not history.windowed:
             continue
         row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points

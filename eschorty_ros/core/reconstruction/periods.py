@@ -68,7 +68,7 @@ class PeriodCutter:
             return
         self._held.append(arrays)
         if self._begin(watermark_us):
-            self._assign_held(watermark_us)
+            self._assign(NO_EVENTS, watermark_us)
 
     @property
     def triggered(self) -> bool:
@@ -156,7 +156,7 @@ class PeriodCutter:
         if not lock.schedule.anchored and not self._begin(END_OF_STREAM_US, last=True):
             return
         if newest_us is not None:
-            self._assign_held(lock.schedule.watermark_after(newest_us))
+            self._assign(NO_EVENTS, lock.schedule.watermark_after(newest_us))
         self._assembler.close()
 
     def _begin(self, watermark_us: int, last: bool = False) -> bool:
@@ -170,9 +170,6 @@ class PeriodCutter:
         first = None if window is None else _part(self._held.arrays, *window)
         self._assembler.restart(self._modulation, schedule.every, schedule.last_us, first)
         return True
-
-    def _assign_held(self, watermark_us: int) -> None:
-        self._assign(NO_EVENTS, watermark_us)
 
     def _assign(self, new: Arrays, watermark_us: int) -> None:
         """Assign the events certain before the watermark, held ones first; hold back the rest."""

@@ -161,8 +161,6 @@ class ProfileAssembler:
         )
         self._state["known_half"] = before._memory.state["known_half"]
         self._memory.columns.counts[:] = 0
-        self._state["rows"] = 0
-        self._done = []
         self._memory.footprint.state["near_edge"] = 0
         self._state["status"] = CLOSED
         _end(self._boxed_memory)

@@ -244,8 +244,8 @@ class Reconstructor:
         triggers, newest_us = triggers_of(words, ahead)
         self._add_triggers(triggers)
         watermark_us = max(self._watermark_us, ahead.settled_us or 0)
-        before, pass_ = self._events_decoded, (words, self._decoder, self._watermark_us)
-        read = self._periods.add_triggered(*pass_, watermark_us)
+        before, floor_us = self._events_decoded, self._watermark_us
+        read = self._periods.add_triggered(words, self._decoder, floor_us, watermark_us)
         self._count_since(before, newest_us)
         for begin in range(read, words.size, _PIECE_WORDS):
             events = self._decoded(words[begin : begin + _PIECE_WORDS])
