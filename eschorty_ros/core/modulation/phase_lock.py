@@ -209,13 +209,13 @@ class PhaseLock:
         if abs(difference) <= _DRIFT_MAX:
             self.schedule.shift(round(_GAIN * difference * period_us))
             self._corrections += 1
-        elif before is not None and _turn(difference - before) < _AGREEMENT:
+        elif before is not None and _apart(difference, before) < _AGREEMENT:
             self.schedule.shift(round(difference * period_us))
             self._relocks += 1
         else:
             self._difference = difference
 
 
-def _turn(difference: float) -> float:
+def _apart(one: float, other: float) -> float:
     """Return the distance of two phases, 0 to half a period."""
-    return abs(difference - round(difference))
+    return abs(one - other - round(one - other))
