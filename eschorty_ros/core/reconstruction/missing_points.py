@@ -17,7 +17,8 @@ _UNMODULATED_SHARE = 0.1
 # Share of the events below which 15 % of the points and more are on other light, in recordings of
 # three simulators; with more it is 3 % at most.
 _LINE_SHARE = 0.1
-_FEW = 10
+# Losses for each point from which on points are few.
+_LOST_PER_POINT = 10
 _LOSSES = {
     "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
     "it, or raise periods_per_profile = {0.periods_per_profile}",
@@ -84,7 +85,7 @@ def _unmodulated(counts: Mapping[str, int], modulation: Modulation, columns: int
     # Background of dark columns, beside those of a line, has fewer events than these.
     line = counts["events_binned"] - counts["events_unmodulated"]
     dark = 2 * counts["events_unmodulated"] * points < line * unmodulated
-    dark &= unmodulated < 10 * points
+    dark &= unmodulated < _LOST_PER_POINT * points
     # As the laser is switched on, and off, a period has no phase.
     switched = 2 * columns if points else 0
     if share <= _UNMODULATED_SHARE or dark or unmodulated <= switched:
@@ -120,7 +121,8 @@ def _too_wide(counts: Mapping[str, int], settings: Settings) -> str:
 
 def _outside_region(counts: Mapping[str, int]) -> str:
     many = 2 * counts["events_outside_roi"] > counts["events"]
-    if not many or counts["columns_too_few_events"] < 10 * counts["points_found"]:
+    lost = counts["columns_too_few_events"]
+    if not many or lost < _LOST_PER_POINT * counts["points_found"]:
         return ""
     share = counts["events_outside_roi"] / counts["events"]
     return (
@@ -148,7 +150,7 @@ def _few_events(
 ) -> str:
     per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
     few = counts["columns_too_few_events"]
-    if few <= 10 * counts["points_found"] or per_column >= EVENTS_WANTED:
+    if few <= _LOST_PER_POINT * counts["points_found"] or per_column >= EVENTS_WANTED:
         return ""
     wanted = math.ceil(periods_per_profile * EVENTS_WANTED / max(per_column, 1e-3))
     return (
@@ -230,7 +232,7 @@ def few_points(
         # Background alone leaves columns with few events, too.
         if len(points) and lost in _WITHOUT_POINT and unused < Settings().events_min * count:
             return []
-    if len(points) and count <= _FEW * len(points):
+    if len(points) and count <= _LOST_PER_POINT * len(points):
         return []
     cause = f"{count:,} {words.format(settings)}" if modulated and count else dark
     return [f"{len(points):,} points: {cause}"]
