@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Decoder
-from eschorty_ros.core.evt3.cuts import pass_over
+from eschorty_ros.core.evt3.cuts import Cut, pass_over
 from eschorty_ros.core.modulation.held_events import NO_EVENTS, Arrays
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
@@ -38,12 +38,12 @@ class EdgeRecorder:
 
     def merge_words(
         self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
-    ) -> tuple[int, int]:
+    ) -> Cut:
         """Decode words up to the end of ``span`` or a trigger; see `ProfileAssembler.merge_words`.
 
         No edge is used: `merge` brings them, too.
         """
-        return pass_over(words, span.end_us, decoder), 0
+        return Cut(pass_over(words, span.end_us, decoder), 0)
 
     def mark(self, read: int) -> None:
         """Drop the events: those of the words read so far can be assembled with the edges."""

@@ -12,6 +12,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.base.pointer import Pointer
 from eschorty_ros.core.evt3 import Decoder, EventArrays
+from eschorty_ros.core.evt3.cuts import Cut
 from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.line.blinking import make_blink
@@ -71,13 +72,6 @@ class Span(NamedTuple):
     end_us: int
     through: bool = False
     one_window: bool = False
-
-
-class _Progress(NamedTuple):
-    """First event, or word, and first edge not processed yet."""
-
-    event: np.int64 | int
-    edge: int
 
 
 class ProfileAssembler:
@@ -201,11 +195,11 @@ class ProfileAssembler:
         """
         parts = EventArrays(*held), EventArrays(*new)
         size = held[0].size + new[0].size
-        progress = _Progress(0, 0)
+        event = edge = 0
         while True:
-            progress = _Progress(*_merge(*parts, edges, progress, self._boxed))
+            event, edge = _merge(*parts, edges, event, edge, self._boxed)
             self._widen()
-            if progress.event == size and progress.edge == edges.t_us.size:
+            if event == size and edge == edges.t_us.size:
                 return
             self._collect()
 
@@ -216,24 +210,23 @@ class ProfileAssembler:
 
     def merge_words(
         self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
-    ) -> tuple[np.int64 | int, int]:
+    ) -> Cut:
         """Decode words straight into the columns of the open period and of those that follow.
 
-        Returns the numbers of words read and of edges used. Advances the decoder's state.
+        Returns the cut after the words read and the edges used. Advances the decoder's state.
 
         - ``span``: The pass stops before the first event at its end or later.
         - ``edges``: Beginnings of periods before the span's end.
         """
-        progress = _Progress(0, 0)
+        cut = Cut(0, 0)
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
-            arguments = words, progress, decoder.boxed, span, edges, self._boxed
-            progress = _Progress(*_merge_words(*arguments))
+            cut = Cut(*_merge_words(words, cut, decoder.boxed, span, edges, self._boxed))
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
                 self._collect()
             if self.window_is_over or not (full or crowded):
-                return progress
+                return cut
 
     def _widen(self) -> bool:
         """Give the columns more room where one is full; return whether it was so."""
@@ -354,15 +347,14 @@ def _merge_part(events, edges, i, edge, drain, period, memory):
 
 
 @entry_kernel
-def _merge(held, new, edges, progress, boxed):
-    """Merge events, first those of ``held``, with edges from ``progress`` on.
+def _merge(held, new, edges, i, edge, boxed):
+    """Merge events from ``i`` on, first those of ``held``, with edges from ``edge`` on.
 
     A period is closed when an event reaches its end or after the last event. Events and edges
     remain when the output has no room for another profile.
     """
     period, size = boxed.content, held.t.size
     memory = period.memory.content
-    i, edge = progress
     if i < size:
         i, edge = _merge_part(held, edges, i, edge, False, period, memory)
         if i < size:
@@ -390,11 +382,11 @@ def _copy(counts, numbers, other_counts, other_numbers):
 
 
 @kernel(_nrt=False)
-def _pass(words, progress, decoder, span, edges, period, memory, before):
+def _pass(words, cut, decoder, span, edges, period, memory, before):
     """Decode words as `_merge_words`, without references; ``before`` is room to undo a part in."""
     columns, gate, state = memory.columns, memory.gate.state, memory.state
     rows_max = memory.output.row.size - memory.rows.row.size
-    i, edge = np.uint64(progress.event), progress.edge
+    i, edge = np.uint64(cut.word), cut.edge
     state.over = 0
     while True:
         # A profile may change the gate.
@@ -435,11 +427,11 @@ def _pass(words, progress, decoder, span, edges, period, memory, before):
         if span.one_window and filled and (learned or state.window == 0):
             state.over = 1
             break
-    return _Progress(np.int64(i), edge)
+    return np.int64(i), edge
 
 
 @entry_kernel
-def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
+def _merge_words(words, cut, boxed_decoder, span, edges, boxed):
     """Decode words into the open period and those that begin at the edges.
 
     It ends before the first event at the end of ``span`` or later, and unless that goes through
@@ -448,5 +440,4 @@ def _merge_words(words, progress, boxed_decoder, span, edges, boxed):
     period, decoder = boxed.content, boxed_decoder.content
     memory = period.memory.content
     before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
-    reached = _pass(words, progress, decoder, span, edges, period, memory, before)
-    return reached.event, reached.edge
+    return _pass(words, cut, decoder, span, edges, period, memory, before)

@@ -110,7 +110,7 @@ class WindowAssembler:
     ) -> Cut:
         """Decode words into periods, as `ProfileAssembler.merge_words` does."""
         if words.size < self._open.events_left // 2:
-            return Cut(*self._open.merge_words(words, decoder, span, edges))
+            return self._open.merge_words(words, decoder, span, edges)
         self._words, self._span, self._edges = words, span._replace(one_window=True), edges
         self._decoder, self._first_decoder = decoder, decoder
         self._at, going = Cut(0, 0), True
