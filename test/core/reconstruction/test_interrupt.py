@@ -43,8 +43,8 @@ random.seed(3)
 signal.signal(signal.SIGALRM, signal.default_int_handler)
 caught = 0
 for _ in range(60):
-    signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-3, duration_s))
     try:
+        signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-3, duration_s))
         reconstruct()
         time.sleep(duration_s)
     except KeyboardInterrupt:
