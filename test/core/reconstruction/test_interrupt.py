@@ -21,7 +21,7 @@ import eschorty_ros as es
 from eschorty_ros.core.evt3 import Encoder
 
 t_us, column, event = np.meshgrid(
-    np.arange(60) * 1000 + 100, np.arange(1280), np.arange(12), indexing="ij"
+    np.arange(20) * 1000 + 100, np.arange(1280), np.arange(12), indexing="ij"
 )
 row, polarity = 350 + event % 3, np.ones(t_us.size, int)
 data = Encoder().encode(t_us.ravel(), column.ravel(), row.ravel(), polarity)
@@ -42,7 +42,7 @@ duration_s = time.perf_counter() - begun_s
 random.seed(3)
 signal.signal(signal.SIGALRM, signal.default_int_handler)
 caught = 0
-for _ in range(60):
+for _ in range(40):
     try:
         signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-3, duration_s))
         reconstruct()
@@ -58,7 +58,7 @@ def test_an_interrupt_at_any_moment_is_an_exception(jobs):
     print("seed 3")
     done = subprocess.run([sys.executable, "-c", SCRIPT, str(jobs)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 50
+    assert int(done.stdout) > 30
 
 
 @pytest.fixture(scope="module")
