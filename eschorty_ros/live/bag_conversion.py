@@ -109,10 +109,12 @@ def bag_to_recording(
             if recorder.failure:
                 raise FormatError(recorder.failure)
         except BaseException:
-            recorder.end(None)
-            recorder.wait(_DISK_S)
-            # Half a recording would look complete.
-            shutil.rmtree(target, ignore_errors=True)
+            try:
+                recorder.end(None)
+                recorder.wait(_DISK_S)
+            finally:
+                # Half a recording would look complete, also where a second signal ends the wait.
+                shutil.rmtree(target, ignore_errors=True)
             raise
     return lacking
 

@@ -280,6 +280,12 @@ def test_an_empty_cloud_is_a_failure_and_replaces_nothing(recording, tmp_path):
     assert facts["counters"]["columns_too_few_events"] > 1000
 
 
+def signal_once(number):
+    """Return what raises a signal when it is first called; a second may cut a clean-up short."""
+    left = [number]
+    return lambda: left and signal.raise_signal(left.pop())
+
+
 @pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])
 @pytest.mark.parametrize("number", ENDINGS)
 def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step, number):
@@ -296,9 +302,11 @@ def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_pat
 
 @pytest.mark.parametrize("number", ENDINGS)
 def test_an_interrupted_reconstruction_leaves_nothing(monkeypatch, recording, tmp_path, number):
+    interrupt = signal_once(number)
+
     def interrupted(*_):
         assert list(tmp_path.rglob("points"))
-        signal.raise_signal(number)
+        interrupt()
 
     monkeypatch.setattr("eschorty_ros.core.reconstruction.offline.place", interrupted)
     result = run("reconstruct", recording, "--out", tmp_path / "cloud.pcd")
@@ -311,11 +319,11 @@ def test_an_interrupted_conversion_leaves_no_half_recording(
     monkeypatch, recording, tmp_path, number
 ):
     good("convert", recording, tmp_path / "bag")
-    write = RawWriter.write
+    write, interrupt = RawWriter.write, signal_once(number)
 
     def interrupted(writer, data):
         write(writer, data)
-        signal.raise_signal(number)
+        interrupt()
 
     monkeypatch.setattr(RawWriter, "write", interrupted)
     result = run("convert", tmp_path / "bag", tmp_path / "rec")
