@@ -476,8 +476,8 @@ class Reconstructor:
         ``points_flagged`` are some of ``points_found`` within the limits, which are the ``points``
         unless ``keep`` is good; ``points_cut``, by the sensor's edge, are some of those.
         ``periods_closed`` had events, ``periods_empty`` none; ``periods_with_points`` are those of
-        profiles with points of any range. ``sensor_drop_words``,
-        ``broken_words`` and ``decoder_*`` come from the decoder.
+        profiles with points of any range. ``sensor_drop_words``, ``broken_words`` and ``decoder_*``
+        come from the decoder.
         """
         counts = Counter(self._counts)
         counts.update(self._periods.counters)

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment of a reconstruction is an exception; a second thread is refused."""
+"""Calls that do not end: Ctrl-C in one is an exception; a second thread is refused meanwhile."""
 
 import subprocess
 import sys
