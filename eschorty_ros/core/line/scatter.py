@@ -5,8 +5,10 @@ is six variances of a single row, less what all of them share. Its ratio to what
 expects scales the expected variance: that of the columns' own rows, which sets the gates of
 smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
 remove. No column is in the means of two of those. So far apart a surface curves: it is the third
-difference of four columns that is zero, or near it. Those twice as far apart have more of what
-texture moves near columns by together, and by far more of a surface's shape, which is no scatter.
+difference of four columns that is zero, or near it.
+
+Differences over twice the distance have more of what texture moves near columns by together, and by
+far more of a surface's shape, which is no scatter.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.pixel_locking import Levels, _clear_levels, empty_levels
 
-# Columns from one to the next of those whose rows, or widths, are compared.
+# Columns from one to the next of those whose rows, or widths, are compared, and of near ones.
 APART = 5
+_CLOSE = 2
 # The same for smoothed rows, unless their means have more columns.
 _NEAR_APART = 8
 _FAR_APART = 16
@@ -39,6 +42,9 @@ _PIXEL2 = 1.0
 # Standard deviations beyond which a difference is an edge, or a neighbour is not averaged, and the
 # mean square of normal deviates within.
 _DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
+# What near columns share, as of steps at random, makes second differences grow with the distance, a
+# surface's shape with its fourth power.
+_SHARED_MAX = APART / _CLOSE
 # Texture of up to 20 columns makes squared third differences twice as far apart up to so many times
 # as large, a surface's shape 64 times.
 _TEXTURE_MAX = 4.0
@@ -55,13 +61,14 @@ class Differences(NamedTuple):
 
 
 class Scatter(NamedTuple):
-    """Differences of rows, and ``near`` and ``far`` ones of smoothed rows.
+    """Differences of rows, and ``close`` ones, and ``near`` and ``far`` ones of smoothed rows.
 
     No difference shows what the ``levels`` do. Only the variances of ``windowed`` means are scaled:
     those over full columns are as expected.
     """
 
     own: Differences
+    close: Differences
     near: Differences
     far: Differences
     levels: Levels
@@ -71,16 +78,16 @@ class Scatter(NamedTuple):
 def empty_scatter(columns: int, windowed: bool) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    own, near, far = np.zeros((3, len(Differences._fields), blocks))
-    return Scatter(
-        Differences(*own), Differences(*near), Differences(*far), empty_levels(blocks), windowed
+    own, close, near, far = (
+        Differences(*sums) for sums in np.zeros((4, len(Differences._fields), blocks))
     )
+    return Scatter(own, close, near, far, empty_levels(blocks), windowed)
 
 
 @kernel
 def _clear_scatter(scatter):
     """Clear all differences."""
-    for sums in (scatter.own, scatter.near, scatter.far):
+    for sums in (scatter.own, scatter.close, scatter.near, scatter.far):
         sums.squares[:] = 0.0
         sums.expected[:] = 0.0
         sums.number[:] = 0.0
@@ -114,12 +121,12 @@ def _usual_ratio(sums, block, least):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, sums):
-    """Add a profile's second differences of rows to the sums.
+def _add_differences(row, sigma2, apart, sums):
+    """Add a profile's second differences of rows, so far ``apart``, to the sums.
 
     Larger ones than scatter has are left out: edges of the surface.
     """
-    columns, apart = row.size, APART
+    columns = row.size
     for block in range(1, sums.number.size - 1):
         ratio = _usual_ratio(sums, block, _DIFFERENCES_MIN)
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
@@ -186,28 +193,45 @@ def _median_difference(row):
     return np.median(known) if known.size >= _OF_PROFILE_MIN else np.inf
 
 
+@kernel
+def _without_shape(close, wide, times_max):
+    """Return the ratio of ``wide`` differences, less what only a surface's shape explains.
+
+    Texture makes them up to so many times the ``close`` ones.
+    """
+    return min(wide, max(close, (times_max * close) ** 2 / wide))
+
+
+@kernel(_nrt=False)
+def _own_ratio(scatter, block):
+    """Return the ratio of rows near a block; -1 where it is not known."""
+    if not scatter.windowed:
+        return 1.0
+    close = _ratio(scatter.close, block, _DIFFERENCES_MIN)
+    wide = _ratio(scatter.own, block, _DIFFERENCES_MIN)
+    if min(close, wide) < 0.0:
+        return max(close, wide)
+    return _without_shape(close, wide, _SHARED_MAX)
+
+
 @kernel(_nrt=False)
 def _smoothed_ratio(scatter, block):
-    """Return the ratio of smoothed rows near a block; -1 where it is not known.
-
-    It is that of far differences, unless they are too large against near ones for anything but the
-    surface's shape.
-    """
+    """Return the ratio of smoothed rows near a block; -1 where it is not known."""
     near = _ratio(scatter.near, block, _SMOOTHED_MIN)
     far = _ratio(scatter.far, block, _SMOOTHED_MIN)
     if min(near, far) < 0.0 or not scatter.windowed:
         return -1.0
-    return min(far, max(near, (_TEXTURE_MAX * near) ** 2 / far))
+    return _without_shape(near, far, _TEXTURE_MAX)
 
 
 @kernel(_nrt=False)
 def _scale(rows, scatter, smoothing):
     """Scale the variances of a profile by the scatter, and widen the smoothing gates by it."""
     returns, columns = rows.row.shape
-    sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], sums)
-    for block in range(1, sums.number.size - 1):
-        ratio = _ratio(sums, block, _DIFFERENCES_MIN) if scatter.windowed else 1.0
+    _add_differences(rows.row[0], rows.sigma2[0], _CLOSE, scatter.close)
+    _add_differences(rows.row[0], rows.sigma2[0], APART, scatter.own)
+    for block in range(1, scatter.own.number.size - 1):
+        ratio = _own_ratio(scatter, block)
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         # Independent events scatter more than those of pixels, and bound what is not measured.
         independent = 1.0 if ratio < 0.0 else 0.0

@@ -118,9 +118,17 @@ def test_sigma_has_what_near_columns_share(together, least):
 
 
 @pytest.mark.parametrize(
-    ("curve_px", "times"), [(2e-4 * (COLUMN - 640.0) ** 2, 1.1), (6.0 * np.sin(COLUMN / 20.0), 2.0)]
+    ("curve_px", "times"),
+    [
+        (2e-4 * (COLUMN - 640.0) ** 2, 1.1),
+        (6.0 * np.sin(COLUMN / 20.0), 2.0),
+        (6.0 * np.sin(COLUMN / 8.0), 1.2),
+        (2.0 * np.sin(COLUMN / 4.0), 1.2),
+        (50.0 * (COLUMN // 5 % 3 == 0), 1.5),
+    ],
+    ids=["parabola", "wave", "ripple", "corrugation", "strips"],
 )
-def test_a_curved_surface_is_no_scatter(curve_px, times):
+def test_the_shape_of_a_surface_is_no_scatter(curve_px, times):
     noise_px = np.random.default_rng(8).normal(0.0, 0.2, 1280)
     flat, curved = (
         smoothed(300.0 + np.rint(4.0 * (true_px + noise_px)) / 4.0)[1]
