@@ -51,12 +51,17 @@ _MOVES = 8.0
 
 
 class BlockSums(NamedTuple):
-    """Sums over the points of a profile by block: rows, widths, variances of rows, and points."""
+    """Sums over the points of a profile by block: rows, widths, variances of rows, and points.
+
+    The row has ``moved`` since the last profile, in those columns that are ``in_both``.
+    """
 
     row: NDArray[np.float64]
     width: NDArray[np.float64]
     sigma2: NDArray[np.float64]
     points: NDArray[np.float64]
+    moved: NDArray[np.float64]
+    in_both: NDArray[np.float64]
 
 
 class BlockMeans(NamedTuple):
@@ -119,7 +124,7 @@ def empty_history(columns: int, windowed: bool) -> LineHistory:
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((12, blocks)))
+    now, recent = BlockSums(*np.zeros((6, blocks))), BlockMeans(*np.zeros((12, blocks)))
     polarities = PolarityMeans(*np.zeros((3, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(now, recent, polarities, step_px, shift_px, moved2, passing2, windowed)
@@ -228,6 +233,15 @@ def _changed_since_steady(recent, block, row, width, width2):
 
 
 @kernel(_nrt=False)
+def _moved(now, block):
+    """Return by how much the rows near a block have moved since the last profile; 0 if not known.
+
+    Of columns that have a point in one of both alone, a sloping surface has other rows.
+    """
+    return _near_sum(now.moved, block) / max(_near_sum(now.in_both, block), 1.0)
+
+
+@kernel(_nrt=False)
 def _move_alike(now, recent):
     """Return whether blocks have moved together since the last profile, as where the unit shakes.
 
@@ -235,9 +249,8 @@ def _move_alike(now, recent):
     """
     blocks, total, squares = 0, 0.0, 0.0
     for block in range(1, now.points.size - 1):
-        points = _near_sum(now.points, block)
-        if points > 0.0 and recent.profiles[block] > 0.0:
-            difference = _near_sum(now.row, block) / points - recent.last[block]
+        if _near_sum(now.points, block) > 0.0 and recent.profiles[block] > 0.0:
+            difference = _moved(now, block)
             blocks += 1
             total += difference
             squares += difference * difference
@@ -266,12 +279,12 @@ def _motion_variance(history, block, row, own2, weight):
 
 
 @kernel(_nrt=False)
-def _jitter_variance(recent, block, row, own2, weight, alike):
+def _jitter_variance(recent, block, difference, own2, weight, alike):
     """Return the variance of rows that jump back and forth, px squared; see `_motion_variance`.
 
     Jumps of more than a row count where blocks move ``alike``.
     """
-    difference, before = row - recent.last[block], recent.difference[block]
+    before = recent.difference[block]
     near = max(abs(difference), abs(before)) < _JITTER_MAX_PX
     if (near or alike) and recent.profiles[block] > 1.0:
         # The smaller of the two: one large jump alone is another surface.
@@ -321,7 +334,7 @@ def _compare_with_recent(history, known, usual, width_variance):
         limit = np.inf
         if profiles > 1.0:
             moved2 = _motion_variance(history, block, row, own2, weight)
-            jitter2 = _jitter_variance(recent, block, row, own2, weight, alike)
+            jitter2 = _jitter_variance(recent, block, _moved(now, block), own2, weight, alike)
             history.moved2[block] = moved2 + jitter2
             # What an edge that passes changes at once is no scatter, and counts little.
             limit = RECENT_PROFILES / profiles * np.sqrt(width2) if known else limit

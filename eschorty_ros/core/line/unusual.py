@@ -313,7 +313,7 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
             smoothing.width[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
         )
     for block in range(1, now.points.size - 1):
-        total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
+        total, width, sigma2, points, moved, in_both = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(
             np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
         ):
@@ -323,8 +323,13 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
                 width += static_width[0, c]
                 sigma2 += rows.sigma2[0, c]
                 points += 1.0
+                difference = row[0, c] - widths.last_row[0, c]
+                if not np.isnan(difference):
+                    moved += difference
+                    in_both += 1.0
         now.row[block], now.width[block] = total, width
         now.sigma2[block], now.points[block] = sigma2, points
+        now.moved[block], now.in_both[block] = moved, in_both
     sigma = _SIGMA_PER_MEDIAN * typical.difference
     _compare_with_recent(history, known, typical.median, WIDTH_COLUMNS * sigma * sigma)
 
