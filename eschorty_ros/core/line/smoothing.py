@@ -223,11 +223,10 @@ def _begin_level(difference, used, level):
 
 @kernel(_nrt=False)
 def _divide(rows, smoothing):
-    """Divide the sums of points and neighbours; return the number of averaged points.
+    """Divide the sums of points and neighbours.
 
     Loops over all columns, each over a few arrays, run in vectors.
     """
-    smoothed = 0
     for k in range(rows.row.shape[0]):
         own, row, used = rows.row[k], smoothing.row[k], smoothing.used[k]
         sigma2, width = smoothing.sigma2[k], smoothing.width[k]
@@ -235,16 +234,14 @@ def _divide(rows, smoothing):
             row[c] = own[c] + row[c] / used[c]
         for c in range(np.uintp(own.size)):
             sigma2[c] /= used[c] * used[c]
-            smoothed += used[c] > 1.0
         for c in range(np.uintp(own.size)):
             near = min(used[c], WIDTH_COLUMNS)
             width[c] = np.nan if np.isnan(own[c]) else np.sqrt(width[c] / near)
-    return smoothed
 
 
 @kernel(_nrt=False)
 def _smooth(rows, smoothing):
-    """Average each point with symmetric pairs of neighbours; return the number of averaged points.
+    """Average each point with symmetric pairs of neighbours.
 
     The pairs are added outwards up to the first one that is incomplete or beyond the gate: a slope
     is preserved, no average crosses a larger step, no empty column is filled. Of the half widths
@@ -279,7 +276,7 @@ def _smooth(rows, smoothing):
                 sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages)
                 smoothing.sigma2[k, c], smoothing.width[k, c] = sums
                 smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
-    return _divide(rows, smoothing)
+    _divide(rows, smoothing)
 
 
 @kernel(_nrt=False)

@@ -120,7 +120,6 @@ COUNTERS = (
     "columns_weak",
     "columns_ambiguous",
     "columns_isolated",
-    "columns_smoothed",
     "columns_two_returns",
     "columns_unmodulated",
     "events_unmodulated",
@@ -486,7 +485,7 @@ def _close(memory):
         place = (5 * state.profiles) % (BLOCK_COLUMNS - 2)
         _measure_levels(memory.columns, rows.row[0], half, memory.gate.state, place, scatter.levels)
     _scale(rows, scatter, smoothing)
-    counters.columns_smoothed += _smooth(rows, smoothing)
+    _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     memory.columns.counts[:] = 0
