@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -191,11 +192,11 @@ class ScanInstrument(Instrument, Protocol):
     def stage_limits(self) -> StageLimits:
         """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
 
-    def begin_scan(self, request: ScanRequest) -> None:
-        """Start to collect points."""
+    def begin_scan(self, request: ScanRequest) -> str:
+        """Start to collect points; return the recording's folder, ``""`` without one."""
 
-    def end_scan(self, scan_id: str) -> ScanSummary:
-        """Publish the points collected."""
+    def end_scan(self, scan_id: str, reason: str) -> ScanSummary:
+        """Publish the points collected; ``reason`` is why the scan ends early, ``""`` otherwise."""
 
 
 def check_request(request: ScanRequest, limits: StageLimits, unit: str = "m") -> None:
@@ -342,7 +343,7 @@ def run_scan(
             instrument.configure_laser(request.frequency_hz, request.duty)
             instrument.report("to_start")
             instrument.move(begin_mm, min(settings.approach_mm_s, limits.speed_max_mm_s))
-            instrument.begin_scan(request)
+            outcome.summary.recording = instrument.begin_scan(request)
             collecting = True
             instrument.laser_on()
             instrument.watch(True)
@@ -372,11 +373,18 @@ def _finish(
     within_s = _FAILED_DRAIN_S if failed else _DRAIN_S
     outcome.attempt(lambda: instrument.drain(timeout_s, within_s))
 
+    begun = outcome.summary
+
     def end_scan() -> None:
-        outcome.summary = instrument.end_scan(request.scan_id)
+        outcome.summary = instrument.end_scan(request.scan_id, outcome.message)
 
     outcome.attempt(end_scan)
     summary = outcome.summary
+    if summary is begun and begun.recording:
+        outcome.message += (
+            f"; `eschorty reconstruct {shlex.quote(begun.recording)}` makes points of what was "
+            "recorded until then"
+        )
     if outcome.end is End.SUCCEEDED and not (
         summary.points and summary.completeness >= settings.completeness_min
     ):

@@ -351,9 +351,10 @@ class Pipeline:
         self._closed_s = now_s
         self.stream.end_recording()
 
-    def end_scan(self) -> ScanReport:
+    def end_scan(self, reason: str = "") -> ScanReport:
         """Return the scan that was collected; what still waits for the stage is lost.
 
+        ``reason`` is why the recording is not that of the entire scan, ``""`` where it is.
         Points are placed again, by the clock as fitted to the entire sweep, and less the lag that
         passes back and forth show.
         """
@@ -367,7 +368,7 @@ class Pipeline:
         lag = pass_lag(*where, direction)
         if lag is not None:
             take_off_lag(*where, direction, lag.lag_us)
-        self.end_recording(scan.points)
+        self.end_recording(scan.points, reason)
         counts = _Counts(*map(sub, self._counts(), self._counts_at_begin))
         return ScanReport(
             scan,

@@ -90,7 +90,7 @@ class ScanRecorder:
         return self.failure
 
     def wait(self, timeout_s: float) -> str:
-        """Wait for the end; return what the recording lacks, ``""`` for nothing."""
+        """Wait for the end; return what the recording lacks of the scan, ``""`` for nothing."""
         if not self._ended.wait(timeout_s):
             return f"the recording {self.folder} is still being written"
         faults = "; ".join(self._log.faults) or self.failure
@@ -232,8 +232,9 @@ class ScanRecorder:
             state="ended",
             packets_lost=self._lost,
             packets_left_out=left_out,
-            reason=reason or self.failure or self._stream_ended or slow or None,
+            reason=self.failure or self._stream_ended or slow or None,
         )
+        lacks = "; ".join(text for text in (self._log.reason, reason) if text) or None
         try:
             if writer is None:
                 with contextlib.suppress(OSError):
@@ -246,7 +247,7 @@ class ScanRecorder:
                 if np.count_nonzero(kept) > 1:
                     writer.replace_stage(samples[kept])
             with self._noted():
-                writer.end(self._log, points)
+                writer.end(replace(self._log, reason=lacks), points)
             writer.close()
         finally:
             self._ended.set()

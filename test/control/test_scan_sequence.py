@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from recording_instrument import LIMITS, RecordingInstrument
+from recording_instrument import FOLDER, LIMITS, RecordingInstrument
 
 from eschorty_ros.control.scan_sequence import (
     End,
@@ -102,7 +102,8 @@ def test_every_interruption_ends_with_the_laser_off_and_at_rest(step, error):
 def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
     instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
     outcome = run_scan(instrument, REQUEST, SETTINGS)
-    assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
+    assert outcome.end is End.ABORTED
+    assert outcome.message.startswith("laser: no answer")
     steps = [name for name in instrument.steps() if name != "stop_stage"]
     assert steps[-3:] == ["laser_off", "drain", "end_scan"]
 
@@ -122,11 +123,27 @@ def test_any_error_of_switching_the_laser_off_leaves_the_stage_at_rest():
 def test_the_first_reason_stays():
     instrument = RecordingInstrument(("move", 2), ScanFailure("camera: gone"))
 
-    def end_scan(scan_id):
+    def end_scan(scan_id, reason):
         raise ScanFailure("reconstruction: gone")
 
     instrument.end_scan = end_scan
-    assert run_scan(instrument, REQUEST, SETTINGS).message == "camera: gone"
+    assert run_scan(instrument, REQUEST, SETTINGS).message.startswith("camera: gone")
+
+
+def test_a_reconstruction_that_has_ended_leaves_its_recording_with_the_remedy():
+    gone = ScanFailure("reconstruction: process 7 is gone; the scan ends")
+    outcome = run_scan(RecordingInstrument(("end_scan", 1), gone), REQUEST, SETTINGS)
+    assert outcome.message == (
+        f"{gone}; `eschorty reconstruct '{FOLDER}'` makes points of what was recorded until then"
+    )
+    assert outcome.summary.recording == FOLDER
+
+
+def test_the_reason_of_an_early_end_reaches_the_recording():
+    instrument, ends = RecordingInstrument(("move", 2), ScanFailure("camera: gone")), []
+    instrument.end_scan = lambda *values: ends.append(values) or ScanSummary(points=5)
+    run_scan(instrument, REQUEST, SETTINGS)
+    assert ends == [(REQUEST.scan_id, "camera: gone")]
 
 
 @pytest.mark.parametrize(

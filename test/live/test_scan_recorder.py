@@ -57,6 +57,15 @@ def test_a_recorded_scan_gives_the_same_points(tmp_path, source, lost):
     assert lost or result.warnings == ()
 
 
+def test_the_recording_of_a_scan_that_ended_early_has_the_reason_and_its_caller_knows_it(
+    tmp_path, source
+):
+    scan = LiveScan(source, tmp_path / "rec")
+    scan.run(reason="canceled")
+    assert scan.recorder.wait(10.0) == ""
+    assert load_recording(tmp_path / "rec").scan.faults == ["canceled"]
+
+
 def test_a_killed_process_leaves_the_recording_up_to_then(tmp_path, source):
     command = [sys.executable, recorded_scan.__file__, source.path, tmp_path / "rec"]
     assert subprocess.run(command, timeout=100).returncode == -9

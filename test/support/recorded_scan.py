@@ -61,7 +61,7 @@ class LiveScan:
                 self.packets.append((decoder.time_us, Packet(seq, stamp_ns, data)))
         self.samples = recording.stage_samples.tolist()
 
-    def run(self, until_us=1 << 60):
+    def run(self, until_us=1 << 60, reason=""):
         """Feed what comes before ``until_us``; return the scan's report, or None before its end.
 
         As in the node, up to three packets wait for each other, and what happens between two
@@ -97,7 +97,7 @@ class LiveScan:
         pipeline.close_period("s", now_s)
         pipeline.complete(now_s + 1.0)
         pipeline.place(now_s + 1.0)
-        return pipeline.end_scan()
+        return pipeline.end_scan(reason)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from eschorty_ros.control.calibration_sequence import run_capture
 from eschorty_ros.control.scan_sequence import ScanSummary, StageLimits
 
 LIMITS = StageLimits((0.0, 220.0), 250.0, 2000.0)
+FOLDER = "/data/of scan"
 
 
 class RecordingInstrument:
@@ -20,7 +21,8 @@ class RecordingInstrument:
             self.calls.append(name)
             if self._failing == (name, self.calls.count(name)):
                 raise self._error
-            return {"end_scan": self._summary, "stage_limits": LIMITS}.get(name)
+            answers = {"begin_scan": FOLDER, "end_scan": self._summary, "stage_limits": LIMITS}
+            return answers.get(name)
 
         return call
 

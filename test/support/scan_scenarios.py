@@ -306,8 +306,11 @@ def assert_refused(bench: Bench, order: Callable[..., tuple[int, Any]], cases: I
     assert len(bench.output_lines()) == lines
 
 
-def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
-    """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
+def camera_killed(bench: Bench, kill: Callable[[], Any]) -> Any:
+    """The camera's process dies mid-scan: aborted, the camera named, light off, points kept.
+
+    Returns the scan's result.
+    """
     before = len(bench.clouds)
     # Slow: DDS holds all messages for some seconds after a process was killed.
     bench.start(**SLOW)
@@ -321,6 +324,7 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     bench.assert_off_and_at_rest()
     assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
     assert_partial(bench, before, result, to_the_end=False)
+    return result
 
 
 def assert_partial(bench: Bench, before: int, result: Any, *, to_the_end: bool) -> None:

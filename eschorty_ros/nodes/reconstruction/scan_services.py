@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
+from eschorty_ros.core.base.errors import one_line
 from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
@@ -74,6 +75,7 @@ class ScanServices:
         self.recordings: set[Path] = set()
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
+        self._reason = ""
         self._refused: tuple[Any, Any, float] = None, None, -math.inf
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
@@ -95,7 +97,7 @@ class ScanServices:
         # Profiles that arrive later come from the background, without light.
         if self._ended is not None and not self._pipeline.placer.holds(self._ended_s):
             ended, self._ended = self._ended, None
-            report = self._pipeline.end_scan()
+            report = self._pipeline.end_scan(self._reason)
             if report.pass_lag is not None:
                 behind = f"points were {report.pass_lag} behind the stage"
                 self._node.get_logger().info(f"{behind}; taken off")
@@ -126,7 +128,7 @@ class ScanServices:
             return response
         # A request is repeated when its answer is lost.
         if self._pipeline.scan_id == scan_id:
-            response.success = True
+            response.success, response.recording = True, self._folder
             return response
         limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
         recorder = self._make_recorder(scan_id, *limits_mm, passes)
@@ -138,6 +140,7 @@ class ScanServices:
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         if response.success:
             self._recorder = recorder
+            response.recording = self._folder
             if recorder is not None:
                 self.recordings.add(recorder.folder)
         elif recorder is not None:
@@ -149,6 +152,11 @@ class ScanServices:
         self._pipeline.end_recording(None, "the node ended during the scan")
         if self._recorder is not None:
             self._recorder.wait(_RECORD_S)
+
+    @property
+    def _folder(self) -> str:
+        """Return the folder of the scan's recording, ``""`` without one."""
+        return "" if self._recorder is None else str(self._recorder.folder)
 
     def _on_heartbeat(self, message: Header, info: Mapping[str, Any]) -> None:
         self._client.check(info)
@@ -171,12 +179,14 @@ class ScanServices:
         if fault:
             self._sender, self._had_client = None, False
             self._node.get_logger().warning(f"{scan_id} was left open ({fault}); ending it")
-            self._in_worker(partial(self._begin_end, scan_id, lambda _: None), 0.0)
+            end = partial(self._begin_end, scan_id, f"left open ({fault})", lambda _: None)
+            self._in_worker(end, 0.0)
 
-    def _begin_end(self, scan_id: str, done: Callable[[ScanReport], None]) -> None:
+    def _begin_end(self, scan_id: str, reason: str, done: Callable[[ScanReport], None]) -> None:
         self._ended_s = time.monotonic()
         self._pipeline.close_period(scan_id, self._ended_s)
         self._ended = done
+        self._reason = reason and f"the scan ended early: {one_line(reason)}"
 
     def _on_end(self, request: Any, response: Any) -> Any:
         finished = threading.Event()
@@ -188,7 +198,7 @@ class ScanServices:
 
         end_s = time.monotonic() + self._timeout_s
         response.success, response.message = self._in_worker(
-            partial(self._begin_end, request.scan_id, done), self._timeout_s
+            partial(self._begin_end, request.scan_id, request.reason, done), self._timeout_s
         )
         if not response.success:
             return response
@@ -211,7 +221,7 @@ class ScanServices:
         response.completeness = report.completeness
         recorder = self._recorder
         fault = "" if recorder is None else recorder.wait(_RECORD_S)
-        response.recording = "" if recorder is None else str(recorder.folder)
+        response.recording = self._folder
         response.message = "; ".join(text for text in (report.message, fault) if text)
         return response
 

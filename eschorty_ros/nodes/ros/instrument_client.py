@@ -355,14 +355,17 @@ class ScanClient(InstrumentClient):
         assert self.monitor.limits is not None
         return self.monitor.limits
 
-    def begin_scan(self, request: ScanRequest) -> None:
-        """Start to collect points; a scan that is still open is ended and published first."""
+    def begin_scan(self, request: ScanRequest) -> str:
+        """Start to collect points; return the recording's folder, ``""`` without one.
+
+        A scan that is still open is ended and published first.
+        """
         state = self.monitor.reconstruction
         if state is not None and state.scan_id:
             self._node.get_logger().warning(f"ending {state.scan_id}, which was left open")
             # The reconstruction may end it meanwhile; what else fails, fails again.
             with contextlib.suppress(ScanFailure):
-                self.end_scan(state.scan_id)
+                self.end_scan(state.scan_id, "it was left open")
         begin = BeginScan.Request(
             scan_id=request.scan_id,
             start=m_from_mm(request.start_mm),
@@ -376,6 +379,7 @@ class ScanClient(InstrumentClient):
             if not answer.retry or time.monotonic() > ends_s:
                 raise ScanFailure(refusal)
             self.tick()
+        return str(answer.recording)
 
     def _begun(self, begin: Any, refusal: str) -> Any:
         """Return the answer; a cancel before it would leave a scan that is never ended.
@@ -385,9 +389,9 @@ class ScanClient(InstrumentClient):
         with self.shielded():
             return self._call("reconstruction/begin_scan", begin, _BEGIN_S, failure=refusal)
 
-    def end_scan(self, scan_id: str) -> ScanSummary:
-        """Publish the points collected."""
-        request = EndScan.Request(scan_id=scan_id)
+    def end_scan(self, scan_id: str, reason: str) -> ScanSummary:
+        """Publish the points collected; ``reason`` is why the scan ends early, ``""`` otherwise."""
+        request = EndScan.Request(scan_id=scan_id, reason=reason)
         answer = self._call("reconstruction/end_scan", request, _ASSEMBLE_S, repeat=False)
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")

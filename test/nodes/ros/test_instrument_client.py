@@ -35,7 +35,7 @@ class CanceledClient(ScanClient):
     """
 
     def __init__(self, *answers, canceled=True):
-        answers = list(answers) or [SimpleNamespace(success=True, message="")]
+        answers = list(answers) or [SimpleNamespace(success=True, message="", recording="")]
         monitor = InstrumentMonitor(lambda: True)
         PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
         self._service_timeout_s = 5.0
@@ -57,7 +57,7 @@ def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects(
 @pytest.mark.parametrize("retry", [True, False])
 def test_a_scan_that_is_refused_begins_later_if_the_reason_may_pass(monkeypatch, retry):
     refused = SimpleNamespace(success=False, message="odom has 2 publishers", retry=retry)
-    taken = SimpleNamespace(success=True, message="")
+    taken = SimpleNamespace(success=True, message="", recording="")
     client = CanceledClient(refused, refused, taken, canceled=False)
     request = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
     if retry:

@@ -16,6 +16,8 @@ from output_log import read_output_log
 from ros_process import NodeProcess, node_name, processes
 from waiting import wait_until
 
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import load_recording
 from eschorty_ros.nodes.ros.domain import free_domain
 
 SCANNER = "eschorty_ros.nodes.scanner.node"
@@ -129,9 +131,10 @@ def test_a_burst_of_goals_leaves_nothing_behind(bench):
     assert canceled.result().status == GoalStatus.STATUS_CANCELED
 
 
-def test_killed_reconstruction_ends_the_scan_at_once(instrument):
-    """The reconstruction dies mid-scan: light off at once, the goal ends with the reason."""
+def test_killed_reconstruction_ends_the_scan_at_once(instrument, tmp_path):
+    """The reconstruction dies mid-scan: light off at once, reason and recording are named."""
     bench, running, _ = instrument
+    assert bench.observer.set_parameter("reconstruction", "record", str(tmp_path))[0]
     process = running["reconstruction"]
     bench.start(**scenarios.SLOW)
     bench.wait_for_sweep()
@@ -144,6 +147,9 @@ def test_killed_reconstruction_ends_the_scan_at_once(instrument):
     print(f"dark {dark_s:.3f} s, goal ended {ended_s:.1f} s after the reconstruction")
     assert status == GoalStatus.STATUS_ABORTED
     assert re.search(r"reconstruction: process \d+ is (gone|dead)", result.message), result.message
+    assert f"`eschorty reconstruct {result.recording}`" in result.message
+    kept = reconstruct_recording(load_recording(result.recording))
+    assert len(kept.points) > scenarios.KEPT_POINTS, kept.warnings
     assert dark_s <= 0.25
     process.kill()
     running["reconstruction"] = started(RECONSTRUCTION, instrument)
@@ -182,7 +188,10 @@ def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scan
     scenarios.full_scan(bench)
 
 
-def test_killed_camera_ends_the_scan(instrument):
+def test_killed_camera_ends_the_scan(instrument, tmp_path):
     bench, running, _ = instrument
-    scenarios.camera_killed(bench, lambda: running["camera"].send(signal.SIGKILL))
+    assert bench.observer.set_parameter("reconstruction", "record", str(tmp_path))[0]
+    result = scenarios.camera_killed(bench, lambda: running["camera"].send(signal.SIGKILL))
+    faults = load_recording(result.recording).scan.faults
+    assert any(re.search("the scan ended early: .*camera", fault) for fault in faults), faults
     assert all(process.running() for name, process in running.items() if name != "camera")
