@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 from action_msgs.msg import GoalStatus
@@ -57,6 +58,10 @@ _HEARTBEAT = "/heartbeat"
 # DDS drops a node that has been killed within 20 s.
 _DEAD_S = 25.0
 _NOT_ACTIVE = "its node is not active; its log has the reason: mend it, configure and activate it"
+_STARTING = (
+    "its node is there; a first start compiles kernels, for some minutes: wait, or run "
+    "`eschorty compile` before"
+)
 _NO_CLOCK = "use_sim_time is true and nothing is on /clock; leave it out with real devices"
 # Longer than until the reconstruction gives up, with the longest stage_timeout.
 _ASSEMBLE_S = 100.0
@@ -176,13 +181,20 @@ class InstrumentClient(PacedWaiting):
         states = self._states.items()
         return [
             (lambda: self._now_ns() > 0, f"{self._node.get_name()}: {_NO_CLOCK}"),
-            *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
+            *((ready, partial(self._absent, name)) for name, ready in servers),
             *((state.active, f"{name}: {_NOT_ACTIVE}") for name, state in states),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
             (lambda: self.monitor.laser_reports, "laser: no state"),
             (lambda: self.monitor.until_ns > begun_ns, self.monitor.cause_of_no_progress),
         ]
+
+    def _absent(self, name: str) -> str:
+        """Return the failure without a service or an action; a node offers it when it has begun."""
+        component, nodes = name.split("/")[0], self._node.get_node_names_and_namespaces()
+        own = (component, self._node.get_namespace())
+        starts = component == "reconstruction" and own in nodes
+        return f"{component}: no {name}" + (f"; {_STARTING}" if starts else "")
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""

@@ -6,6 +6,7 @@ import pytest
 from delayed_laser import DelayedLaser
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.action import Scan
+from rclpy.node import Node
 from ros_process import NAMESPACE, nodes_here, wait_until
 from scan_scenarios import Goals
 
@@ -47,6 +48,30 @@ def test_simulated_time_without_a_clock_is_named_while_the_scan_waits(observer, 
         lambda: any("scan waits: " in array.status[0].message for array in list(reports)),
         "the missing clock in the diagnostics",
     )
+
+
+class Starting(Node):
+    """A reconstruction that is being made."""
+
+    def __init__(self, **given):
+        super().__init__("reconstruction", **given)
+
+    def safe_state(self):
+        """Do nothing: it has no device."""
+
+
+def test_a_reconstruction_that_still_compiles_is_named_with_the_remedy(
+    observer, start, monkeypatch
+):
+    """Its node is there, and offers nothing before its kernels are compiled."""
+    monkeypatch.setattr(drivers, "make", lambda *_: DelayedLaser())
+    start(Starting)
+    start(LaserNode)
+    goals = scans(observer, start, node_timeout=5.0)
+    goals.start(**GOAL)
+    _, result = goals.end()
+    assert result.message.startswith("reconstruction: no reconstruction/begin_scan within 5 s; ")
+    assert "run `eschorty compile` before" in result.message
 
 
 class Lost(DelayedLaser):
