@@ -206,7 +206,8 @@ def _open_window(points: Points, title: str) -> None:
     open3d = load_open3d("--window")
     xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
     shape = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz))
-    # Its loop calls no handler of Python.
+    # Its loop calls no handler of Python. What ``nohup`` ignores stays ignored.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     open3d.visualization.draw_geometries([shape], window_name=title)

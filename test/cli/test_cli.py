@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -343,6 +344,27 @@ def test_a_command_goes_on_without_its_terminal_where_sighup_is_ignored(
         good("reconstruct", recording, "--out", tmp_path / "cloud.pcd")
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_window_stays_open_without_its_terminal_where_sighup_is_ignored(monkeypatch, cloud):
+    """Its loop calls no handler of Python."""
+    handlers = []
+    same = lambda value: value  # noqa: E731
+    open3d = SimpleNamespace(
+        geometry=SimpleNamespace(PointCloud=same),
+        utility=SimpleNamespace(Vector3dVector=same),
+        visualization=SimpleNamespace(
+            draw_geometries=lambda *_, **__: handlers.append(signal.getsignal(signal.SIGHUP))
+        ),
+    )
+    monkeypatch.setattr("eschorty_ros.simulation.scenes.load_open3d", lambda _: open3d)
+    for handler in (signal.SIG_IGN, signal.SIG_DFL):
+        before = signal.signal(signal.SIGHUP, handler)
+        try:
+            good("view", cloud, "--window")
+        finally:
+            signal.signal(signal.SIGHUP, before)
+    assert handlers == [signal.SIG_IGN, signal.SIG_DFL]
 
 
 def test_simulate_refuses_to_overwrite_a_recording(recording):
