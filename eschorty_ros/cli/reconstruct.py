@@ -125,6 +125,7 @@ def command(
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
       eschorty reconstruct monday/* --dask tcp://host:8786
     """  # noqa: D301
+    refuse_given(["stage_speed_mm_s"], "is for the node; a recording's own speed is used")
     calls = _calls(recordings, out)
     task = partial(
         reconstruct_to,
@@ -260,6 +261,7 @@ def _reconstruct(
     from eschorty_ros.report.accuracy import measure_recorded
 
     chosen = replace(recorded_settings(loaded), **given)
+    chosen.check_effect(given)
     with _progress("reconstructing", show) as report, folder_beside(target) as folder:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)

@@ -132,6 +132,7 @@ def test_help_imports_nothing_heavy():
         ("simulate", "--stop", "100000", "--out", "x"),
         ("simulate", "--speed", "1e30", "--out", "x"),
         ("convert", __file__, "x", "--packet-period", "9"),
+        ("reconstruct", "x", "--stage-speed-mm-s", "9"),
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):
@@ -279,6 +280,13 @@ def test_an_empty_cloud_is_a_failure_and_replaces_nothing(recording, tmp_path):
     facts = json.loads(done.stdout)
     assert (facts["points"], len(facts["warnings"])) == (0, 1)
     assert facts["counters"]["columns_too_few_events"] > 1000
+
+
+def test_an_option_without_effect_is_refused_with_the_reason(recording, tmp_path):
+    out = tmp_path / "cloud.pcd"
+    refused = run("reconstruct", recording, "--detail", "off", "--centroid", "mean", "--out", out)
+    assert_fails_in_one_line(refused, "detail has no effect while centroid is mean; leave it out")
+    assert not out.exists()
 
 
 def signal_once(number):

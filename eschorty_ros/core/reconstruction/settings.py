@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any, Self
@@ -22,16 +22,18 @@ TRIGGER_SOURCES = ("laser", "stage", "none")
 
 
 def _number(
-    default: float, low: float, high: float, unit: str, description: str
+    default: float, low: float, high: float, unit: str, description: str, **idle: Any
 ) -> Any:  # a dataclass field stands in for the value it describes
     return field(
-        default=default, metadata={"description": description, "unit": unit, "range": (low, high)}
+        default=default,
+        metadata={"description": description, "unit": unit, "range": (low, high), "idle": idle},
     )
 
 
-def _choice(default: str, choices: tuple[str, ...], description: str) -> Any:
+def _choice(default: str, choices: tuple[str, ...], description: str, **idle: Any) -> Any:
     return field(
-        default=default, metadata={"description": description, "unit": "", "choices": choices}
+        default=default,
+        metadata={"description": description, "unit": "", "choices": choices, "idle": idle},
     )
 
 
@@ -40,7 +42,7 @@ class Settings:
     """Settings of a reconstruction, from events to points.
 
     Every field carries ``metadata``: ``description``, ``unit`` and ``range`` (both ends included)
-    or ``choices``.
+    or ``choices``; ``idle`` has another setting's values with which this one has no effect.
 
     Notes
     -----
@@ -113,11 +115,13 @@ class Settings:
     smoothing_gate_px: float = _number(
         2.0, 0.0, 100.0, "px",
         "neighbours further off in rows are not averaged, unless rows scatter as much",
+        smoothing_half_width=(0,),
     )  # fmt: skip
     isolation_gate_px: float = _number(
         12.0, 0.0, 720.0, "px",
         "a point with fewer events than isolation_events needs a neighbouring column this near in "
         "rows",
+        isolation_events=(0,),
     )  # fmt: skip
     isolation_events: int = _number(
         10, 0, 1000, "events",
@@ -130,11 +134,13 @@ class Settings:
     footprint_sigma_px: float = _number(
         4.1, 0.3, 60.0, "px",
         "standard deviation of the laser line's intensity over the rows, for reflectance",
+        reflectance=("off",),
     )  # fmt: skip
     white_width_px: float = _number(
         0.0, 0.0, 200.0, "px",
         "width (standard deviation of the rows) of a white target, to which reflectance refers; "
         "0 takes the median of each profile",
+        reflectance=("off",),
     )  # fmt: skip
     reflectance_compensation: str = _choice(
         "off", SWITCH, "correct the shift of points at reflectance steps"
@@ -143,6 +149,7 @@ class Settings:
         300.0, -10_000.0, 10_000.0, "mm/s",
         "stage speed towards +y, from which the compensation follows a step through the "
         "line, 0 for a resting one; a recording's own speed is used instead",
+        reflectance_compensation=("off",),
     )  # fmt: skip
     organized: str = _choice(
         "off", SWITCH, "the cloud of a scan as a height map of profiles and columns, NaN where "
@@ -163,6 +170,7 @@ class Settings:
         "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
         "where these scatter less than means of twice the events would, or, of a line that moves "
         "fast, less than the means",
+        centroid=tuple(name for name in CENTROIDS if name != "mode_mean"),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -201,6 +209,16 @@ class Settings:
             return cls(**values)
         except ArgumentError as error:
             raise FormatError(f"{file}: {error}") from error
+
+    def check_effect(self, names: Container[str]) -> None:
+        """Raise ``ArgumentError`` when one of these settings has no effect beside the others."""
+        for item in fields(self):
+            for other, values in item.metadata["idle"].items():
+                if item.name in names and (value := getattr(self, other)) in values:
+                    raise ArgumentError(
+                        f"{item.name} has no effect while {other} is {value}; leave it out, or "
+                        f"choose another {other}"
+                    )
 
     def allowed(self, modulation: Modulation) -> Settings:
         """Return the settings with no more periods in a profile than a modulation allows."""

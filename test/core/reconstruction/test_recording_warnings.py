@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eschorty_ros.core.base.errors import CalibrationError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.evt3 import words as w3
@@ -234,6 +234,29 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
     result = reconstruct_recording(change(recording), Settings(**settings))
     assert (len(result.points) > 0) == points
     assert sum(words in line for line in result.warnings) == 1, result.warnings
+
+
+@pytest.mark.parametrize(
+    ("others", "idle"),
+    [
+        ({"centroid": "median"}, {"detail": "off"}),
+        ({"smoothing_half_width": 0}, {"smoothing_gate_px": 0.1}),
+        ({"isolation_events": 0}, {"isolation_gate_px": 0.1}),
+        ({"reflectance": "off"}, {"footprint_sigma_px": 9.0}),
+        ({"reflectance": "off"}, {"white_width_px": 9.0}),
+        ({"reflectance_compensation": "off"}, {"stage_speed_mm_s": 9.0}),
+    ],
+)
+def test_a_setting_without_effect_beside_the_others_is_named(recording, others, idle):
+    settings = Settings(**others, **idle)
+    with_it, without = (
+        reconstruct_recording(recording, chosen).points for chosen in (settings, Settings(**others))
+    )
+    np.testing.assert_array_equal(with_it, without)
+    settings.check_effect(others)
+    (name,), (other,) = idle, others
+    with pytest.raises(ArgumentError, match=f"{name} has no effect while {other} is"):
+        settings.check_effect(idle)
 
 
 @pytest.mark.parametrize("hz", [35, 210])
