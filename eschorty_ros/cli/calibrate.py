@@ -327,10 +327,10 @@ def _finish(report: CalibrationReport, made_with: Mapping[str, str], out: Path) 
     from eschorty_ros.report.calibration_page import calibration_html
 
     page = calibration_html(report, made_with)
+    report_replaced(out, out.with_suffix(".html"))
     # Last, so that an old one stays where the page has no room.
     with atomic_write(out.with_suffix(".html")) as stream:
         stream.write(page.encode())
-    report_replaced(out)
     save_calibration(report.calibration, out)
     _show(report)
     click.echo(str(out))

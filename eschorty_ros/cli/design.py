@@ -121,8 +121,8 @@ def command(
     if light:
         click.echo(light)
     for out in outs:
+        report_replaced(out)
         if is_yaml(out):
-            report_replaced(out)
             save_calibration(build.calibration(out.stem), out)
         else:
             _draw(build, np.linspace(near, last, 400), out)

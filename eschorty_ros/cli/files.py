@@ -41,8 +41,8 @@ def check_picture(out: Path, *inputs: Path, others: tuple[str, ...] = ()) -> Non
     check_output(out, *inputs)
 
 
-def report_replaced(path: Path) -> None:
-    """Print which older result is replaced."""
-    if path.is_file():
+def report_replaced(*paths: Path) -> None:
+    """Print which older results are replaced."""
+    for path in filter(Path.is_file, paths):
         made = datetime.datetime.fromtimestamp(path.stat().st_mtime)
         click.echo(f"{path} of {made:%Y-%m-%d %H:%M} is replaced", err=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import show, table, warn
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_picture, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_picture, json_option, report_replaced
 from eschorty_ros.cli.options import Number
 from eschorty_ros.surfaces.plane import COMMON_SHARE
 
@@ -87,6 +87,7 @@ def command(
         from eschorty_ros.report import figures
         from eschorty_ros.report.surface_figures import measured_figure
 
+        report_replaced(out)
         figures.save(measured_figure(points, measured, cloud.name), out)
         click.echo(str(out), err=as_json)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option, report_replaced
 from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
@@ -54,8 +54,9 @@ def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None
     check_output(target, cloud)
     with progress_bar("meshing") as report:
         made = mesh(read_cloud(cloud), sigmas, report)
-    write_mesh(target, made)
     picture = target.with_suffix(".png")
+    report_replaced(target, picture)
+    write_mesh(target, made)
     figures.save(mesh_figure(made, sigmas, cloud.name), picture)
     if as_json:
         levels = [level._asdict() for level in made.levels]

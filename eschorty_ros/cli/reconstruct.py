@@ -15,7 +15,7 @@ import click
 from eschorty_ros.cli.cluster import on_cluster
 from eschorty_ros.cli.console import accuracy_rows, of_total, pairs, progress_bar, warn
 from eschorty_ros.cli.convert import recording_of
-from eschorty_ros.cli.files import OUT_FILE, json_option
+from eschorty_ros.cli.files import OUT_FILE, json_option, report_replaced
 from eschorty_ros.cli.options import Integer, Number, recorded_options, refuse_given, stated
 from eschorty_ros.core.base.errors import EschortyError
 
@@ -269,6 +269,7 @@ def _reconstruct(
         report(1.0, "scoring and writing")
         measured = measure_recorded(result.points, result.profiles, loaded)
         if len(result.points):
+            report_replaced(target)
             write_cloud(target, result.points if result.organized is None else result.organized)
         return summary(result), measured
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import progress_bar, show, table, warn
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, json_option, report_replaced
 from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
@@ -108,8 +108,9 @@ def command(
             joined = join(joined, part, pose)
             poses.append(pose)
             sizes.append(len(part))
-    write_cloud(out, joined)
     picture = out.with_suffix(".png")
+    report_replaced(out, picture)
+    write_cloud(out, joined)
     figures.save(joined_figure(joined, sizes, str(out)), picture)
     if as_json:
         facts = [_facts(path, pose) for path, pose in zip(clouds[1:], poses, strict=True)]

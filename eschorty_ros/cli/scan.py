@@ -186,7 +186,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
 
     if len(result.points):
         cloud = result.points if result.organized is None else result.organized
-        report_replaced(out / "scan.pcd")
+        report_replaced(out / "scan.pcd", out / "scan.png")
         write_cloud(out / "scan.pcd", cloud)
         (out / "scan.png").unlink(missing_ok=True)
     if not result.success or not len(result.points):

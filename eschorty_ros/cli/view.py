@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar, warn
-from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, check_picture
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, check_output, check_picture, report_replaced
 from eschorty_ros.cli.instrument import nodes_module
 from eschorty_ros.cli.options import page_options, refuse_given
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
@@ -125,6 +125,7 @@ def _draw(cloud: Path, target: Path) -> None:
     else:
         check_picture(target, cloud)
     points, own = _read(cloud)
+    report_replaced(target)
     if grows:
         _draw_growing(points, own, target)
     else:

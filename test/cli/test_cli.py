@@ -91,7 +91,8 @@ def cloud(tmp_path):
     line, column = (a.ravel() for a in np.mgrid[0:5, 0:200])
     points = np.zeros(line.size, POINT_DTYPE)
     points["x"], points["y"], points["t"] = 1.32, line * 7e-4, line / 70.0
-    points["column"], points["sigma"], points["intensity"] = column, 7e-4, 20
+    points["z"], points["column"], points["sigma"] = column * 2.6e-4, column, 7e-4
+    points["intensity"] = 20
     write_cloud(tmp_path / "flat.pcd", points)
     return tmp_path / "flat.pcd"
 
@@ -596,10 +597,32 @@ def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
     assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_design_reports_the_calibration_that_it_replaces(tmp_path):
-    out = tmp_path / "made.yaml"
-    assert "is replaced" not in run("design", "--out", out).stderr
-    assert "is replaced" in run("design", "--out", out).stderr
+@pytest.mark.parametrize(
+    ("command", "name", "pictures"),
+    [
+        ("design", "made.yaml", ()),
+        ("design", "made.svg", ()),
+        ("view", "flat.svg", ()),
+        ("measure", "step.svg", ()),
+        ("mesh", "part.ply", ("part.png",)),
+        ("register", "both.pcd", ("both.png",)),
+    ],
+)
+def test_a_command_names_the_results_that_it_replaces(
+    monkeypatch, cloud, tmp_path, command, name, pictures
+):
+    # Meshing and registering need open3d.
+    made = SimpleNamespace(rms_sigmas=0.7, vertices=[], triangles=[])
+    for function in ("mesh.mesh", "register.register"):
+        monkeypatch.setattr(f"eschorty_ros.surfaces.{function}", lambda *_: made)
+    monkeypatch.setattr("eschorty_ros.surfaces.register.join", lambda cloud, *_: cloud)
+    clouds = {"design": [], "register": [cloud] * 2}.get(command, [cloud])
+    results = [tmp_path / name, *(tmp_path / picture for picture in pictures)]
+    for path in results:
+        path.touch()
+    printed = run(command, *clouds, "--out", results[0]).stderr
+    for path in results:
+        assert re.search(rf"{path} of .* is replaced", printed), printed
 
 
 def test_design_finds_the_tilt_for_two_ranges():
