@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from eschorty_ros.cli.console import decimals, show, table
+from eschorty_ros.cli.console import decimals, show, table, warn
 from eschorty_ros.cli.files import (
     OUT_FILE,
     check_output,
@@ -100,6 +100,12 @@ def command(
         refuse_given(["wavelength_nm"], "belongs to --power-mw")
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
+    for name, range_mm in (("near", given["near_mm"]), ("far", far_mm)):
+        if range_mm is not None and 0.0 < range_mm < given["focal_length_mm"]:
+            warn(
+                f"--{name}-mm is {range_mm:g} mm, less than the focal length; ranges are in mm, "
+                f"{range_mm:g} m are {1e3 * range_mm:g}"
+            )
     for out in outs:
         if is_yaml(out):
             check_output(out)

@@ -625,6 +625,13 @@ def test_a_command_names_the_results_that_it_replaces(
         assert re.search(rf"{path} of .* is replaced", printed), printed
 
 
+def test_a_range_that_may_be_in_metres_is_named_with_the_unit():
+    assert "--near-mm is 0.5 mm" in run("design", "--near-mm", 0.5).stderr
+    far = run("design", "--far-mm", 1.5).stderr
+    assert "--far-mm is 1.5 mm, less than the focal length; ranges are in mm, 1.5 m are 1500" in far
+    assert run("design", "--near-mm", 500, "--far-mm", 1500).stderr == ""
+
+
 def test_design_finds_the_tilt_for_two_ranges():
     assert "sensor -7.6" in good("design", "--near-mm", 784.6, "--far-mm", 2115.9)
     assert run("design", "--near-mm", 900, "--far-mm", 800).exit_code == 1
