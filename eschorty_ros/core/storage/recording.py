@@ -211,8 +211,13 @@ def load_recording(
         raise FormatError(f"{folder} is not a folder; give a recording folder; {RAW_ALONE}")
     given = {CALIBRATION_FILE: calibration, LASER_FILE: frequency_hz}
     _check_files(folder, {name for name, value in given.items() if value is not None})
-    samples = read_stage_csv(folder / STAGE_FILE)
     scan = read_scan_yaml(folder / SCAN_FILE) if (folder / SCAN_FILE).exists() else None
+    try:
+        samples = read_stage_csv(folder / STAGE_FILE)
+    except FormatError as error:
+        # A process that was killed at once has written no two samples.
+        faults = scan.faults if scan is not None else []
+        raise FormatError("; ".join((str(error), *faults))) from error
     settings, marks = folder / SETTINGS_FILE, folder / MARKS_FILE
     laser, build = folder / LASER_FILE, folder / CALIBRATION_FILE
     own = calibration if calibration and not build.is_file() else load_calibration(build)

@@ -36,6 +36,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_a_recording_whose_process_was_killed_at_once_says_so(folder):
+    (folder / "stage.csv").write_text("t_us,position_mm\n")
+    edit("scan.yaml", SCAN)(folder)
+    with pytest.raises(FormatError, match=r"stage samples: 0; .*; the recording was not ended"):
+        load_recording(folder)
+
+
 def test_a_complete_folder(folder):
     recording = load_recording(str(folder))
     assert recording.path == folder
