@@ -323,7 +323,7 @@ def summary(result: Result) -> dict[str, Any]:
     points = result.points
     return {
         "events": result.events,
-        "dropped_events": result.counters["events_dropped"],
+        "dropped_events": result.counters["events_over_column_limit"],
         "profiles": result.profile_count,
         "periods_per_profile": result.periods_per_profile,
         "points": len(points),

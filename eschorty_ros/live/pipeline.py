@@ -426,7 +426,7 @@ class Pipeline:
             events=counters["events"],
             packets=self.stream.packets,
             packets_lost=self.stream.packets_lost,
-            events_dropped=counters["events_dropped"],
+            events_dropped=counters["events_over_column_limit"],
             packets_refused=self.packets_refused,
             periods_empty=counters["periods_empty"],
         )

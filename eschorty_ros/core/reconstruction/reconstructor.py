@@ -469,8 +469,6 @@ class Reconstructor:
         ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
         ``events_over_column_limit`` + ``events_outside_roi`` + ``events_outside_phase`` +
         ``events_held`` (not assigned yet).
-        Of those only ``events_over_column_limit`` are ``events_dropped``: without light there is no
-        phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser. ``events_used`` are those of the points, of any range.
         ``points_flagged`` are some of ``points_found`` within the limits, which are the ``points``
@@ -485,6 +483,5 @@ class Reconstructor:
         counts["events_outside_phase"] += counts.pop("events_before_first_edge")
         if self._compensator is not None:
             counts["columns_compensated"] += self._compensator.columns_compensated
-        counts["events_dropped"] = counts["events_over_column_limit"]
         counts.update(decoder_counts(self._decoder.counters))
         return dict(counts)

@@ -56,7 +56,7 @@ class Reports:
         state.profiles = saturated(pipeline.profiles)
         state.points = saturated(pipeline.points)
         state.packets_lost = saturated(pipeline.stream.packets_lost)
-        state.events_dropped = saturated(counters["events_dropped"])
+        state.events_dropped = saturated(counters["events_over_column_limit"])
         state.sensor_drop_words = saturated(counters["sensor_drop_words"])
         state.points_without_stage = saturated(pipeline.placer.points_without_stage)
         state.scan_id = pipeline.scan_id

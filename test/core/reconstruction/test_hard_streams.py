@@ -434,7 +434,7 @@ def test_what_does_not_follow_the_laser_moves_no_points(case):
     assert np.median(np.abs(error_px(found))) < 0.09
     assert len(found) > 0.99 * 12 * 1280
     assert reconstructor.counters["events_unmodulated"] > 0
-    assert reconstructor.counters["events_dropped"] == 0
+    assert reconstructor.counters["events_over_column_limit"] == 0
 
 
 def test_the_rest_of_a_period_before_the_light_gives_no_points():
@@ -460,7 +460,7 @@ def test_the_rest_of_a_period_before_the_light_gives_no_points():
 def test_no_event_of_a_full_column_is_lost(camera, settings):
     found, reconstructor = points(camera, camera.line(lambda k, c: wavy(0, c)), **settings)
     every = settings.get("periods_per_profile", 1)
-    assert reconstructor.counters["events_dropped"] == 0
+    assert reconstructor.counters["events_over_column_limit"] == 0
     assert reconstructor.counters["events"] > 220 * 1280 * camera.periods / every
     assert len(found) == camera.periods // every * 1280
     assert np.abs(found.row - wavy(0, found.column.astype(float))).max() < 1.0
