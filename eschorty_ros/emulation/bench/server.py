@@ -28,12 +28,12 @@ from eschorty_ros.emulation.bus import PtyPort, UsbServer
 from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
 from eschorty_ros.simulation.pixels import PRESETS
-from eschorty_ros.simulation.world import BACKGROUND_HZ
 
 _LOCK_FILE = "lock"
 _SWITCH_S = 5e-4
 _POLL_S = 0.1
 _CLIENTS_END_S = 3.0
+_DEFAULTS = BenchSettings()
 
 
 @contextlib.contextmanager
@@ -139,20 +139,20 @@ def _locked(folder: Path) -> Iterator[None]:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.argument("folder", required=False, type=click.Path(file_okay=False, path_type=Path))
-@click.option("--scene", default="steps", show_default=True,
+@click.option("--scene", default=_DEFAULTS.scene, show_default=True,
               help="Scene before the camera: a name or a mesh file.")  # fmt: skip
-@click.option("--calibration", default="config_3", show_default=True,
+@click.option("--calibration", default=_DEFAULTS.calibration, show_default=True,
               help="The actual optical build: a name in config/ or a file.")  # fmt: skip
-@click.option("--pixels", type=click.Choice(tuple(PRESETS)), default="paper", show_default=True,
-              help="Preset of the event pixels.")  # fmt: skip
-@click.option("--effects", default="none", show_default=True, metavar="NAME=VALUE,...",
+@click.option("--pixels", type=click.Choice(tuple(PRESETS)), default=_DEFAULTS.pixels,
+              show_default=True, help="Preset of the event pixels.")  # fmt: skip
+@click.option("--effects", default=_DEFAULTS.effects, show_default=True, metavar="NAME=VALUE,...",
               help="Effects of the world, such as ambient=0.5,occlusion=1.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
+@click.option("--seed", type=click.IntRange(0), default=_DEFAULTS.seed, show_default=True,
               help="Seed of pixels, noise, jitter and missing edges.")  # fmt: skip
-@click.option("--background", type=click.FloatRange(0.0, 100.0), default=BACKGROUND_HZ,
+@click.option("--background", type=click.FloatRange(0.0, 100.0), default=_DEFAULTS.background_hz,
               show_default=True, help="Background events of one pixel, Hz.")  # fmt: skip
-@click.option("--trigger", type=click.Choice(TRIGGERS), default="stage", show_default=True,
-              help="Source wired to the camera's trigger input.")  # fmt: skip
+@click.option("--trigger", type=click.Choice(TRIGGERS), default=_DEFAULTS.trigger,
+              show_default=True, help="Source wired to the camera's trigger input.")  # fmt: skip
 @click.option("--missing-edges", type=click.FloatRange(0.0, 1.0), default=0.0, show_default=True,
               help="Share of the trigger edges that the camera misses.")  # fmt: skip
 @click.option("--sensor-ppm", type=float, default=0.0, show_default=True,
