@@ -110,9 +110,13 @@ class ProfileLength:
                 self.fills_columns = self._is_everywhere(held, begin, end)
             if found:
                 self.window = begin, end
-            elif window is None:
+                break
+            if window is None:
                 return 1
-            elif end > HELD_EVENTS_MAX:
+            if begin == held.searched and end - begin < 2 * _SAMPLE:
+                # All its events were looked at: the phase lock would find no more in them.
+                held.searched = end
+            if end > HELD_EVENTS_MAX:
                 if self._modulation.on_edge_us is not None:
                     return 1
                 held.refuse(end)

@@ -8,7 +8,10 @@ from reconstructing import CALIBRATION, reconstruct
 
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.held_events import HeldEvents
+from eschorty_ros.core.modulation.phase_estimate import estimation_window
 from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.reconstruction.profile_length import ProfileLength
 
 SEED = 5
 SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0, periods_per_profile=1)
@@ -132,3 +135,14 @@ def test_noise_moves_nothing():
     edges, counts = edges_of(data, Modulation(1000.0))
     assert np.abs(off(edges, 1000.0, 0.0)).max() < 0.02
     assert counts["phase_relocks"] == 0
+
+
+def test_windows_that_showed_no_laser_are_searched_once():
+    """A minute in the dark must not delay the first light."""
+    modulation, held = Modulation(200.0), HeldEvents()
+    dark = noise(0, 4_000_000, 100_000)
+    held.append(dark)
+    assert ProfileLength(modulation).choose(held, 4_000_000) == 0
+    rest = dark[0][held.searched :]
+    assert held.searched > 0
+    assert estimation_window(rest, 4_000_000, modulation) is None
