@@ -210,6 +210,9 @@ class InstrumentMonitor:
             return "reconstruction: it does not report"
         if not self._camera_present():
             return "camera: its node is gone, no events"
+        if self.reconstruction and math.isfinite(self.reconstruction.packet_age_s):
+            busy = "reconstruction: packets arrive, but it processes none"
+            return f"{busy}; look at the computer's load and at its log"
         return "camera: no events reach the reconstruction; look at the logs of both nodes"
 
 

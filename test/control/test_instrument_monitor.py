@@ -1,5 +1,6 @@
 """What the monitor finds out about the other nodes: their clocks, processes and progress."""
 
+import math
 import subprocess
 import time
 
@@ -82,10 +83,16 @@ def test_a_drain_ends_although_there_is_progress():
 
 
 def test_a_drain_without_any_progress_has_no_pace():
-    waiting = PacedWaiting("scanner", monitor(), lambda: 10**18, lambda: True, 3.0)
+    waiting = PacedWaiting("scanner", monitor(camera=math.nan), lambda: 10**18, lambda: True, 3.0)
     waiting.prepare(lambda: False, lambda phase: None)
     with pytest.raises(ScanFailure, match=r"camera: no events reach the reconstruction for 0\.3 s"):
         waiting.drain(0.3, 0.1)
+
+
+def test_packets_that_arrive_at_a_busy_reconstruction_are_no_fault_of_the_camera():
+    busy = r"reconstruction: packets arrive, but it processes none for 0 s; .* load"
+    with pytest.raises(ScanFailure, match=busy):
+        monitor().check_progress(0.0)
 
 
 def test_a_slow_drain_goes_on_while_the_rest_takes_no_longer_than_the_limit():
