@@ -149,7 +149,8 @@ class ScanReport:
 
     def _cause_of_empty(self) -> str:
         if not (self.events and self.points_outside):
-            return f"no points: {without_modulation(self.events, self.frequency_hz)}"
+            dark = without_modulation(self.events, self.frequency_hz)
+            return f"no points: {'; '.join(self.warnings) or dark}"
         if not self.profiles_expected:
             return "no points: the stage has not moved by a profile between start and stop"
         return (

@@ -92,6 +92,12 @@ def test_a_scan_without_points_has_the_reason(points, events, without, outside, 
     assert (report.completeness > 0.0) == bool(points)
 
 
+def test_a_scan_without_points_has_the_warnings_of_the_stream_for_a_reason():
+    empty = ScanBuffer("a", 0.0, 1.0).assemble()
+    report = ScanReport(empty, 100, 1, 0, 0, 0, 0, 0, 1, 70.0, ("widen range_min", "look here"))
+    assert report.message == "no points: widen range_min; look here"
+
+
 @pytest.mark.parametrize(
     ("profiles", "possible", "surplus"),
     [(97, 100, False), (104, 100, False), (190, 200, False), (190, 100, True), (120, 100, True)],
