@@ -86,7 +86,8 @@ def bag_to_recording(
             chosen.setdefault("trigger_source", "stage")
         limits = {"start_mm": -POSITION_LIMIT_MM, "stop_mm": POSITION_LIMIT_MM}
         scan = _from_custom(path, custom, _SCAN)
-        full = replace(scan, data={"scan_id": path.stem, **limits, **scan.data})
+        begun = {"scan_id": path.stem, **limits, **scan.data, "state": "recording"}
+        full = replace(scan, data=begun)
         log = validate(ScanLog, full, FormatError)
         build = calibration or _calibration(source)
         stream = PacketStream(build, Settings.from_file(chosen, path), 0.0, packet_period_s)

@@ -8,6 +8,7 @@ import sqlite3
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 import pytest
@@ -59,6 +60,26 @@ def write_messages(bag, messages, custom):
             names = message.fields.__dataclass_fields__.keys() - {"__msgtype__"}
             fields = {name: getattr(message.fields, name) for name in names}
             target.write(message.kind, message.t_ns, **fields)
+
+
+def test_a_conversion_that_is_killed_leaves_a_recording_that_was_not_ended(
+    tmp_path, scanned, monkeypatch
+):
+    bag, folder, killed = tmp_path / "bag", tmp_path / "rec", tmp_path / "killed"
+    recording_to_bag(scanned, bag)
+    messages = bag_files.BagReader.messages
+
+    def copied_after_the_last(self, *kinds):
+        yield from messages(self, *kinds)
+        if bag_files.ODOMETRY in kinds:
+            while not (folder / "scan.yaml").exists():
+                sleep(0.01)
+            shutil.copytree(folder, killed)
+
+    monkeypatch.setattr(bag_files.BagReader, "messages", copied_after_the_last)
+    bag_to_recording(bag, folder)
+    assert "state: recording" in (killed / "scan.yaml").read_text()
+    assert "state: ended" in (folder / "scan.yaml").read_text()
 
 
 @pytest.mark.parametrize("storage", bag_files.STORAGES)
