@@ -445,6 +445,8 @@ class Reconstructor:
         """Return the warnings about the stream since its counters were ``before``."""
         found: list[str] = []
         counts = {name: count - before.get(name, 0) for name, count in self.counters.items()}
+        # Events held before count among those of a cause once they are assigned.
+        counts["events"] -= counts["events_held"]
         if self._periods.fills_columns:
             found.append(
                 "light that follows the laser comes from many rows of a column, and that of a line "

@@ -11,11 +11,11 @@ from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.reconstruction import Reconstructor, Settings, reconstruct_recording
 from eschorty_ros.core.reconstruction.settings import KEEP
 from eschorty_ros.core.reconstruction.stage_faults import stage_faults
 from eschorty_ros.core.storage import ScanLog, load_recording
-from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
 from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
@@ -257,6 +257,23 @@ def test_a_setting_without_effect_beside_the_others_is_named(recording, others, 
     (name,), (other,) = idle, others
     with pytest.raises(ArgumentError, match=f"{name} has no effect while {other} is"):
         settings.check_effect(idle)
+
+
+def test_events_that_waited_for_the_phase_are_of_the_light_that_showed_it(recording):
+    """A share of more than all of them was reported."""
+    words = b"".join(RawReader(recording.events_path))
+    size = len(words) // 64 * 2
+    reconstructor = Reconstructor(NARROW, Modulation(70.0), Settings(column_first=1500))
+    at = held = 0
+    while held <= (count := reconstructor.counters["events_held"]):
+        before, held = reconstructor.counters, count
+        reconstructor.push(words[at : at + size])
+        at += size
+    reconstructor.flush()
+    (line,) = reconstructor.warnings_since(before)
+    share, _, cause = line.partition("%")
+    assert cause.startswith(" of the events are outside the limits")
+    assert int(share) <= 100
 
 
 @pytest.mark.parametrize("hz", [35, 210])
