@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
-from eschorty_ros.control.scan_sequence import ScanFailure, StageLimits
+from eschorty_ros.control.scan_sequence import MoveLimits, ScanFailure
 from eschorty_ros.control.stamp_ages import StampAges
 from eschorty_ros.hardware.base.protocols import LaserOutput
 
@@ -66,7 +66,7 @@ class InstrumentMonitor:
         self._camera_present = camera_present
         self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
         self._samples_from_ns = math.inf
-        self.limits: StageLimits | None = None
+        self.limits: MoveLimits | None = None
         self.laser: LaserReport | None = None
         self.laser_failed = False
         self.reconstruction: ReconstructionStatus | None = None

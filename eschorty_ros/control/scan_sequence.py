@@ -60,7 +60,7 @@ class ScanRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class StageLimits:
+class MoveLimits:
     """Travel, speed and acceleration of the stage's moves."""
 
     travel_mm: tuple[float, float]
@@ -189,7 +189,7 @@ class Instrument(Protocol):
 class ScanInstrument(Instrument, Protocol):
     """Instrument for a scan, whose points the reconstruction collects."""
 
-    def stage_limits(self) -> StageLimits:
+    def stage_limits(self) -> MoveLimits:
         """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
 
     def begin_scan(self, request: ScanRequest) -> str:
@@ -199,7 +199,7 @@ class ScanInstrument(Instrument, Protocol):
         """Publish the points collected; ``reason`` is why the scan ends early, ``""`` otherwise."""
 
 
-def check_request(request: ScanRequest, limits: StageLimits, unit: str = "m") -> None:
+def check_request(request: ScanRequest, limits: MoveLimits, unit: str = "m") -> None:
     """Raise ``ArgumentError`` with name, value and remedy unless the scan can be done.
 
     Lengths in messages are in ``unit``, ``m`` or ``mm``.
@@ -248,7 +248,7 @@ def check_laser(frequency_hz: float, duty: float) -> None:
         )
 
 
-def sweep_ends_mm(request: ScanRequest, limits: StageLimits) -> tuple[float, float]:
+def sweep_ends_mm(request: ScanRequest, limits: MoveLimits) -> tuple[float, float]:
     """Return start and end of the sweep, within the travel.
 
     Speed is constant from start to stop if the travel leaves room for the run-up.

@@ -1,9 +1,9 @@
 """An instrument that records the steps of a sequence."""
 
 from eschorty_ros.control.calibration_sequence import run_capture
-from eschorty_ros.control.scan_sequence import ScanSummary, StageLimits
+from eschorty_ros.control.scan_sequence import MoveLimits, ScanSummary
 
-LIMITS = StageLimits((0.0, 220.0), 250.0, 2000.0)
+LIMITS = MoveLimits((0.0, 220.0), 250.0, 2000.0)
 FOLDER = "/data/of scan"
 
 

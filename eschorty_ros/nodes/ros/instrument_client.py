@@ -31,17 +31,16 @@ from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import (
     End,
+    MoveLimits,
     ScanFailure,
     ScanRequest,
     ScanSummary,
-    StageLimits,
 )
 from eschorty_ros.core.base.errors import one_line
 from eschorty_ros.core.base.numbers import number, positive
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.live.device_messages import ns_from_stamp
-from eschorty_ros.msg import LaserState, ReconstructionState
-from eschorty_ros.msg import StageLimits as StageLimitsMessage
+from eschorty_ros.msg import LaserState, ReconstructionState, StageLimits
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stage_position_mm
@@ -360,7 +359,7 @@ class ScanClient(InstrumentClient):
         "reconstruction/end_scan": EndScan,
     }
 
-    def stage_limits(self) -> StageLimits:
+    def stage_limits(self) -> MoveLimits:
         """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
         self.wait(lambda: self.monitor.limits is not None, self._service_timeout_s,
                   "stage: no limits on stage/limits")  # fmt: skip
@@ -483,9 +482,9 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
             age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
-    def on_limits(message: StageLimitsMessage) -> None:
+    def on_limits(message: StageLimits) -> None:
         low, high = (number(name, getattr(message, name)) for name in ("travel_low", "travel_high"))
-        monitor.limits = StageLimits(
+        monitor.limits = MoveLimits(
             (mm_from_m(low), mm_from_m(high)),
             mm_from_m(positive("speed_max", message.speed_max)),
             mm_from_m(positive("acceleration", message.acceleration)),
@@ -502,7 +501,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         (TransitionEvent, "laser/transition_event", on_laser_node, 10),
         (ReconstructionState, "reconstruction/state", on_reconstruction, 10),
         (Odometry, "stage/odom", on_stage, qos.stream()),
-        (StageLimitsMessage, "stage/limits", on_limits, qos.latched()),
+        (StageLimits, "stage/limits", on_limits, qos.latched()),
         (Header, "reconstruction/heartbeat", on_heartbeat, qos.heartbeat()),
     ):
         node.create_subscription(kind, topic_name, callback, profile, callback_group=group)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from eschorty_ros.control.scan_sequence import StageLimits
+from eschorty_ros.control.scan_sequence import MoveLimits
 from eschorty_ros.hardware.base.protocols import LinearStage
 from eschorty_ros.hardware.stage.apt_setup import CONTROLLERS, AptSettings
 from eschorty_ros.hardware.stage.apt_stage import open_stage
@@ -33,9 +33,9 @@ DRIVER_TABLE = (
 )
 
 
-def stage_limits(parameters: Mapping[str, Any]) -> StageLimits:
+def stage_limits(parameters: Mapping[str, Any]) -> MoveLimits:
     """Return the caps on what the controller reports."""
-    return StageLimits(
+    return MoveLimits(
         travel_mm=(mm_from_m(parameters["travel_low"]), mm_from_m(parameters["travel_high"])),
         speed_max_mm_s=mm_from_m(parameters["speed_max"]),
         acceleration_mm_s2=mm_from_m(parameters["acceleration"]),
