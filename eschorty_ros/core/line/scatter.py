@@ -42,11 +42,9 @@ _PIXEL2 = 1.0
 # Standard deviations beyond which a difference is an edge, or a neighbour is not averaged, and the
 # mean square of normal deviates within.
 _DEVIATIONS_MAX, _WITHIN2 = 3.0, 0.973
-# What near columns share, as of steps at random, makes second differences grow with the distance, a
-# surface's shape with its fourth power.
-_SHARED_MAX = APART / _CLOSE
-# Texture of up to 20 columns makes squared third differences twice as far apart up to so many times
-# as large, a surface's shape 64 times.
+# What near columns share makes squared second differences of columns ``APART`` up to 2.5 times as
+# large as close ones, a surface's shape 39 times. Texture of up to 20 columns makes squared third
+# differences twice as far apart up to so many times as large, a shape 64 times.
 _TEXTURE_MAX = 4.0
 # Largest factor of a variance, and one over the least.
 _FACTOR_MAX = 64.0
@@ -194,12 +192,9 @@ def _median_difference(row):
 
 
 @kernel
-def _without_shape(close, wide, times_max):
-    """Return the ratio of ``wide`` differences, less what only a surface's shape explains.
-
-    Texture makes them up to so many times the ``close`` ones.
-    """
-    return min(wide, max(close, (times_max * close) ** 2 / wide))
+def _without_shape(close, wide):
+    """Return the ratio of ``wide`` differences, less what only a surface's shape explains."""
+    return min(wide, max(close, (_TEXTURE_MAX * close) ** 2 / wide))
 
 
 @kernel(_nrt=False)
@@ -211,7 +206,7 @@ def _own_ratio(scatter, block):
     wide = _ratio(scatter.own, block, _DIFFERENCES_MIN)
     if min(close, wide) < 0.0:
         return max(close, wide)
-    return _without_shape(close, wide, _SHARED_MAX)
+    return _without_shape(close, wide)
 
 
 @kernel(_nrt=False)
@@ -221,7 +216,7 @@ def _smoothed_ratio(scatter, block):
     far = _ratio(scatter.far, block, _SMOOTHED_MIN)
     if min(near, far) < 0.0 or not scatter.windowed:
         return -1.0
-    return _without_shape(near, far, _TEXTURE_MAX)
+    return _without_shape(near, far)
 
 
 @kernel(_nrt=False)
