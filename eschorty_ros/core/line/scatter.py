@@ -7,7 +7,7 @@ smoothing, and again that of the smoothed rows, since columns share some of what
 remove. No column is in the means of two of those. So far apart a surface curves: it is the third
 difference of four columns that is zero, or near it.
 
-Differences over twice the distance have more of what texture moves near columns by together, and by
+Differences over more columns have more of what texture moves near columns by together, and by
 far more of a surface's shape, which is no scatter.
 """
 
@@ -22,7 +22,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.pixel_locking import Levels, _clear_levels, empty_levels
 
-# Columns from one to the next of those whose rows, or widths, are compared, and of near ones.
+# Columns from one to the next of those whose rows, or widths, are compared, and of close ones.
 APART = 5
 _CLOSE = 2
 # The same for smoothed rows, unless their means have more columns.

@@ -149,7 +149,6 @@ class Settings:
         300.0, -10_000.0, 10_000.0, "mm/s",
         "stage speed towards +y, from which the compensation follows a step through the "
         "line, 0 for a resting one; a recording's own speed is used instead",
-        reflectance_compensation=("off",),
     )  # fmt: skip
     organized: str = _choice(
         "off", SWITCH, "the cloud of a scan as a height map of profiles and columns, NaN where "

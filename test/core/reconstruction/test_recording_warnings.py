@@ -244,7 +244,6 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
         ({"isolation_events": 0}, {"isolation_gate_px": 0.1}),
         ({"reflectance": "off"}, {"footprint_sigma_px": 9.0}),
         ({"reflectance": "off"}, {"white_width_px": 9.0}),
-        ({"reflectance_compensation": "off"}, {"stage_speed_mm_s": 9.0}),
     ],
 )
 def test_a_setting_without_effect_beside_the_others_is_named(recording, others, idle):
