@@ -321,7 +321,7 @@ def _begin_period(edges, edge, period, memory):
     state.period = edges.period[edge]
 
 
-@kernel(inline="always")
+@kernel
 def _merge_part(events, edges, i, edge, drain, period, memory):
     """Merge events from ``i`` on, and with ``drain`` the edges after the last one."""
     state, rows_max = memory.state, memory.output.row.size - memory.rows.row.size

@@ -25,6 +25,29 @@ def _total(x):
 
 print(_total(1))
 """
+KEPT = """
+import numpy as np
+from eschorty_ros.core.base.kernel import kernel
+
+@kernel
+def _root(x):
+    if x < 0:
+        raise ValueError("negative")
+    return np.sqrt(np.full(3, x)).sum()
+"""
+KEEPING = """
+from callee import _root
+from eschorty_ros.core.base.kernel import entry_kernel
+
+@entry_kernel
+def _scaled(x):
+    return {factor} * _root(x)
+
+try:
+    _scaled(-1.0)
+except ValueError as error:
+    print(f"{{_scaled(1.0):.0f}} raised", error)
+"""
 INTERRUPTED = """
 from llvmlite.binding import executionengine
 from eschorty_ros.core.base.kernel import entry_kernel
@@ -74,6 +97,15 @@ def test_a_change_in_another_file_reaches_the_kernels_that_use_it(tmp_path, sign
     assert result(factor=20, scale=2) == 22
     assert result(factor=20, scale=3) == 23
     assert len(list(tmp_path.glob("cache/*/*_total*.nbi"))) == 1
+
+
+def test_a_kept_kernel_is_used_by_a_new_one(tmp_path):
+    (tmp_path / "callee.py").write_text(KEPT)
+    for factor, seen in ((2, "6 raised"), (3, "9 raised")):
+        (tmp_path / "caller.py").write_text(KEEPING.format(factor=factor))
+        assert output(tmp_path, str(tmp_path / "caller.py")) == f"{seen} negative\n"
+    kept = [each.name for each in (tmp_path / "cache").rglob("*.nbc")]
+    assert sum("_root" in name for name in kept) == 1, kept
 
 
 def test_an_argument_type_that_exists_no_more_does_not_break_the_cache(tmp_path):
