@@ -23,6 +23,7 @@ _MOVE_ENDS_S = 0.3
 # A stage needs some seconds to begin a move, and longer on a busy computer.
 _MOTION_S = 15.0
 _HEARTBEAT_S = 3.0
+_MODULATION_TOLERANCE = 1e-3
 _SAMPLES_MAX = 500_000
 
 
@@ -135,6 +136,18 @@ class InstrumentMonitor:
     def output(self) -> int | None:
         """Return the output that the laser reads back, ``None`` before its first status."""
         return self.laser.output if self.laser is not None else None
+
+    def other_modulation(self, frequency_hz: float, duty: float) -> str:
+        """Return how the modulation read back differs, ``""`` if it does not; 0 is any value."""
+        if self.laser is None:
+            return "laser: no state"
+        for name, requested, read, unit in (
+            ("frequency", frequency_hz, self.laser.frequency_hz, " Hz"),
+            ("duty", duty, self.laser.duty, ""),
+        ):
+            if requested and not math.isclose(read, requested, rel_tol=_MODULATION_TOLERANCE):
+                return f"laser: {name} reads back {read:g}{unit}, requested {requested:g}{unit}"
+        return ""
 
     @property
     def at_rest(self) -> bool:

@@ -164,7 +164,7 @@ class Instrument(Protocol):
         """End a move under way and wait until the stage rests."""
 
     def laser_on(self) -> None:
-        """Start the heartbeat, arm, enable; return when the output reads back on."""
+        """Start the heartbeat, arm, enable; return when the output reads back on, as it was set."""
 
     def laser_off(self) -> None:
         """Disable; return when the output reads back off. The heartbeat ends in any case."""

@@ -117,6 +117,7 @@ class InstrumentClient(PacedWaiting):
         self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
         self._node_timeout_s = node_timeout_s
         self._service_timeout_s = service_timeout_s
+        self._modulation = 0.0, 0.0
         self._heartbeat_on = False
         self._heartbeat = Heartbeat(
             node, CLIENT_HEARTBEAT, self._light_requested, lambda: self._heartbeat_on
@@ -197,29 +198,21 @@ class InstrumentClient(PacedWaiting):
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""
-        requested = {
-            name: float(value)
-            for name, value in (("frequency", frequency_hz), ("duty", duty))
-            if value
-        }
-        if not requested:
+        self._modulation = frequency_hz, duty
+        messages = [Parameter(name, value=float(value)).to_parameter_msg()
+                    for name, value in (("frequency", frequency_hz), ("duty", duty))
+                    if value]  # fmt: skip
+        if not messages:
             return
-        messages = [Parameter(name, value=value).to_parameter_msg()
-                    for name, value in requested.items()]  # fmt: skip
         answer = self._call("laser/set_parameters", SetParameters.Request(parameters=messages))
         for result in answer.results:
             if not result.successful:
                 raise ScanFailure(f"laser: {result.reason}")
+        self.wait(lambda: not self._other_modulation(), self._service_timeout_s,
+                  self._other_modulation)  # fmt: skip
 
-        def applied() -> bool:
-            laser = self.monitor.laser
-            if laser is None:
-                return False
-            read = {"frequency": laser.frequency_hz, "duty": laser.duty}
-            return all(abs(read[name] - value) <= 1e-3 * value for name, value in requested.items())
-
-        self.wait(applied, self._service_timeout_s,
-                  f"laser: its state does not show {requested}")  # fmt: skip
+    def _other_modulation(self) -> str:
+        return self.monitor.other_modulation(*self._modulation)
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
         """Move the stage and wait for the end of the motion."""
@@ -257,7 +250,7 @@ class InstrumentClient(PacedWaiting):
             self._answer(future, "stage/move")
 
     def laser_on(self) -> None:
-        """Start the heartbeat, arm, enable; return when the output reads back on."""
+        """Start the heartbeat, arm, enable; return when the output reads back on, as it was set."""
         self.tick()
         self._heartbeat_on = True
         self._heartbeat.begin()
@@ -274,6 +267,8 @@ class InstrumentClient(PacedWaiting):
                 self.tick()
         self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
                   "laser: its output does not read back on")  # fmt: skip
+        if fault := self._other_modulation():
+            raise ScanFailure(f"{fault}; another program has set it: stop that program")
 
     def _arm_and_enable(self) -> str:
         """Return the laser's reason when it refuses, ``""`` when it does not."""

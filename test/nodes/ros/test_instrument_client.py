@@ -7,7 +7,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 
 from eschorty_ros.control import paced_waiting
-from eschorty_ros.control.instrument_monitor import InstrumentMonitor
+from eschorty_ros.control.instrument_monitor import InstrumentMonitor, LaserReport
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure, ScanRequest
 from eschorty_ros.hardware.base.protocols import LaserOutput
@@ -39,6 +39,7 @@ class CanceledClient(ScanClient):
         monitor = InstrumentMonitor(lambda: True)
         PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
         self._service_timeout_s = 5.0
+        self._modulation = 0.0, 0.0
         self._clients = {
             "reconstruction/begin_scan": SimpleNamespace(
                 call_async=lambda request: Answered(answers.pop(0), 3)
@@ -130,8 +131,29 @@ def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
     client, refusals, waits = CanceledClient(canceled=False), [reason, reason, ""], []
     client._heartbeat = SimpleNamespace(begin=lambda: None, healthy=True)
     client._arm_and_enable = lambda: refusals.pop(0)
-    client.monitor.laser = SimpleNamespace(output=LaserOutput.ON)
+    client.monitor.update_laser(LaserReport(LaserOutput.ON, 70.0, 0.5, ""), 0.0)
     client._feedback = lambda phase: waits.append(client.waits_for)
     client.laser_on()
     assert set(waits) == {"", reason}
     assert client.waits_for == ""
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (LaserReport(LaserOutput.ON, 50.0, 0.3, ""), "frequency reads back 50 Hz, requested 70 Hz"),
+        (LaserReport(LaserOutput.ON, 70.0, 0.9, ""), "duty reads back 0.9, requested 0.3"),
+    ],
+)
+def test_a_modulation_that_another_program_sets_before_the_light_ends_the_sequence(other, words):
+    client = CanceledClient(canceled=False)
+    taken = SimpleNamespace(results=[SimpleNamespace(successful=True)] * 2)
+    client._clients["laser/set_parameters"] = SimpleNamespace(
+        call_async=lambda request: Answered(taken, 1)
+    )
+    client.monitor.update_laser(LaserReport(LaserOutput.OFF, 70.0, 0.3, ""), 0.0)
+    client.configure_laser(70.0, 0.3)
+    client._heartbeat = SimpleNamespace(begin=lambda: None, healthy=True)
+    client._arm_and_enable = lambda: client.monitor.update_laser(other, 0.0)
+    with pytest.raises(ScanFailure, match=f"^laser: {words}; another program has set it"):
+        client.laser_on()
