@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Protocol
 
-from eschorty_ros.control.scan_sequence import End, Instrument, Outcome, check_laser, end_light
+from eschorty_ros.control.scan_sequence import (
+    End,
+    Instrument,
+    Outcome,
+    check_laser,
+    check_sweep,
+    end_light,
+)
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration import METHODS
@@ -26,7 +32,10 @@ class CaptureInstrument(Instrument, Protocol):
 
 
 def check_request(request: CaptureRequest) -> None:
-    """Raise ``ArgumentError`` with name, value and remedy unless the capture can be done."""
+    """Raise ``ArgumentError`` with name, value and remedy unless the capture can be done.
+
+    `run_capture` checks the sweep, by the stage's limits.
+    """
     if request.method not in METHODS:
         raise ArgumentError(
             f"method is {short(request.method)}; choose one of {', '.join(METHODS)}"
@@ -48,13 +57,6 @@ def check_request(request: CaptureRequest) -> None:
     if len(request.targets) != 1:
         raise ArgumentError(
             f"targets holds {len(request.targets)}; with sweep_speed give the one that moves"
-        )
-    if not (sweep.speed_mm_s > 0.0 and math.isfinite(sweep.speed_mm_s)):
-        raise ArgumentError(f"sweep_speed is {sweep.speed_mm_s * 1e-3:g} m/s; choose more than 0")
-    if not abs(sweep.stop_mm - sweep.start_mm) > 0.0:
-        raise ArgumentError(
-            f"sweep_start and sweep_stop are both {sweep.start_mm * 1e-3:g} m; choose different "
-            "ones"
         )
     if not 0.0 < abs(sweep.range_per_stage) <= 1.0:
         raise ArgumentError(
@@ -85,6 +87,10 @@ def run_capture(
             instrument.check_nodes()
             instrument.configure_laser(request.frequency_hz, request.duty)
             if sweep is not None:
+                limits = instrument.stage_limits()
+                check_sweep(
+                    sweep.start_mm, sweep.stop_mm, sweep.speed_mm_s, limits, prefix="sweep_"
+                )
                 instrument.move(sweep.start_mm, min(_APPROACH_MM_S, sweep.speed_mm_s))
             instrument.laser_on()
             instrument.watch(True)

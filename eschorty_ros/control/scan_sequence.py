@@ -154,6 +154,9 @@ class Instrument(Protocol):
     def check_nodes(self) -> None:
         """Raise ``ScanFailure`` that names the component that does not answer."""
 
+    def stage_limits(self) -> MoveLimits:
+        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
+
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""
 
@@ -189,9 +192,6 @@ class Instrument(Protocol):
 class ScanInstrument(Instrument, Protocol):
     """Instrument for a scan, whose points the reconstruction collects."""
 
-    def stage_limits(self) -> MoveLimits:
-        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
-
     def begin_scan(self, request: ScanRequest) -> str:
         """Start to collect points; return the recording's folder, ``""`` without one."""
 
@@ -204,34 +204,47 @@ def check_request(request: ScanRequest, limits: MoveLimits, unit: str = "m") -> 
 
     Lengths in messages are in ``unit``, ``m`` or ``mm``.
     """
-    scale = 1.0 if unit == "mm" else 1e-3
-    low, high = (f"{end * scale:g}" for end in limits.travel_mm)
-    for name in ("start_mm", "stop_mm"):
-        value = getattr(request, name)
-        if not limits.travel_mm[0] <= value <= limits.travel_mm[1]:
-            raise ArgumentError(
-                f"{name[:-3]} is {value * scale:g} {unit}; choose {low} to {high} {unit}, "
-                "the stage's travel"
-            )
-    if request.start_mm == request.stop_mm:
-        raise ArgumentError(
-            f"start and stop are both {request.start_mm * scale:g} {unit}; choose different ones"
-        )
-    if not SPEED_MIN_MM_S <= request.speed_mm_s <= limits.speed_max_mm_s:
-        raise ArgumentError(
-            f"speed is {request.speed_mm_s * scale:g} {unit}/s; choose "
-            f"{SPEED_MIN_MM_S * scale:g} to {limits.speed_max_mm_s * scale:g} {unit}/s"
-        )
+    check_sweep(request.start_mm, request.stop_mm, request.speed_mm_s, limits, unit)
     if not 1 <= request.passes <= PASSES_MAX:
         raise ArgumentError(f"passes is {request.passes}; choose 1 to {PASSES_MAX}")
     check_laser(request.frequency_hz, request.duty)
     length_mm = abs(request.stop_mm - request.start_mm)
+    scale = 1.0 if unit == "mm" else 1e-3
     if request.frequency_hz and length_mm < request.speed_mm_s / request.frequency_hz:
         raise ArgumentError(
             f"start to stop is {length_mm * scale:.4g} {unit}, less than the travel of one period, "
             f"{request.speed_mm_s / request.frequency_hz * scale:.4g} {unit} at "
             f"{request.speed_mm_s * scale:g} {unit}/s and {request.frequency_hz:g} Hz; choose a "
             "longer sweep or a lower speed"
+        )
+
+
+def check_sweep(
+    start_mm: float,
+    stop_mm: float,
+    speed_mm_s: float,
+    limits: MoveLimits,
+    unit: str = "m",
+    prefix: str = "",
+) -> None:
+    """Raise ``ArgumentError`` unless the stage can do the sweep; ``prefix`` begins its names."""
+    scale = 1.0 if unit == "mm" else 1e-3
+    low, high = (f"{end * scale:g}" for end in limits.travel_mm)
+    for name, value in (("start", start_mm), ("stop", stop_mm)):
+        if not limits.travel_mm[0] <= value <= limits.travel_mm[1]:
+            raise ArgumentError(
+                f"{prefix}{name} is {value * scale:g} {unit}; choose {low} to {high} {unit}, "
+                "the stage's travel"
+            )
+    if start_mm == stop_mm:
+        raise ArgumentError(
+            f"{prefix}start and {prefix}stop are both {start_mm * scale:g} {unit}; choose "
+            "different ones"
+        )
+    if not SPEED_MIN_MM_S <= speed_mm_s <= limits.speed_max_mm_s:
+        raise ArgumentError(
+            f"{prefix}speed is {speed_mm_s * scale:g} {unit}/s; choose "
+            f"{SPEED_MIN_MM_S * scale:g} to {limits.speed_max_mm_s * scale:g} {unit}/s"
         )
 
 

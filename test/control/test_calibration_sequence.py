@@ -20,7 +20,19 @@ MOVING = CaptureRequest(TWO[:1], "joint", sweep=Sweep(10.0, 60.0, 20.0, 1.0))
     ("request_", "steps"),
     [
         (RESTING, ["begin", "check_nodes", "configure_laser", "laser_on", "collect"]),
-        (MOVING, ["begin", "check_nodes", "configure_laser", "move", "laser_on", "move", "move"]),
+        (
+            MOVING,
+            [
+                "begin",
+                "check_nodes",
+                "configure_laser",
+                "stage_limits",
+                "move",
+                "laser_on",
+                "move",
+                "move",
+            ],
+        ),
     ],
 )
 def test_order_of_a_capture(request_, steps):
@@ -69,8 +81,6 @@ def test_a_failure_on_the_way_out_fails_the_capture_and_the_rest_still_runs(step
         (CaptureRequest(TWO, frequency_hz=5.0), "frequency is 5 Hz"),
         (CaptureRequest(TWO, duty=1.5), "duty is 1.5"),
         (CaptureRequest(TWO, sweep=MOVING.sweep), "with sweep_speed give the one"),
-        (CaptureRequest(TWO[:1], sweep=Sweep(0.0, 9.0, -1.0, 1.0)), "sweep_speed is -0.001 m/s"),
-        (CaptureRequest(TWO[:1], sweep=Sweep(9.0, 9.0, 1.0, 1.0)), "both 0.009 m"),
         (CaptureRequest(TWO[:1], sweep=Sweep(0.0, 9.0, 1.0, 0.0)), "range_per_stage is 0"),
         (CaptureRequest(TWO[:1], sweep=Sweep(0.0, 9.0, 1.0, math.nan)), "range_per_stage is nan"),
     ],
@@ -78,3 +88,22 @@ def test_a_failure_on_the_way_out_fails_the_capture_and_the_rest_still_runs(step
 def test_bad_requests_are_named(request_, words):
     with pytest.raises(ArgumentError, match=words):
         check_request(request_)
+
+
+@pytest.mark.parametrize(
+    ("sweep", "words"),
+    [
+        (Sweep(-1.0, 9.0, 1.0, 1.0), "sweep_start is -0.001 m; choose 0 to 0.22 m, the stage's"),
+        (Sweep(0.0, 221.0, 1.0, 1.0), "sweep_stop is 0.221 m; choose 0 to 0.22 m, the stage's"),
+        (Sweep(9.0, 9.0, 1.0, 1.0), "sweep_start and sweep_stop are both 0.009 m"),
+        (Sweep(0.0, 9.0, -1.0, 1.0), "sweep_speed is -0.001 m/s"),
+        (Sweep(0.0, 9.0, 251.0, 1.0), "sweep_speed is 0.251 m/s"),
+        (Sweep(0.0, 9.0, math.nan, 1.0), "sweep_speed is nan m/s"),
+    ],
+)
+def test_a_sweep_that_the_stage_cannot_do_ends_before_it_moves_and_before_light(sweep, words):
+    instrument = RecordingInstrument()
+    outcome = instrument.capture(CaptureRequest(TWO[:1], sweep=sweep))
+    assert outcome.end is End.ABORTED
+    assert outcome.message.startswith(words)
+    assert not {"move", "laser_on"} & set(instrument.calls)

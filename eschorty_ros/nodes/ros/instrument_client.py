@@ -196,6 +196,13 @@ class InstrumentClient(PacedWaiting):
         starts = component == "reconstruction" and own in nodes
         return f"{component}: no {name}" + (f"; {_STARTING}" if starts else "")
 
+    def stage_limits(self) -> MoveLimits:
+        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
+        self.wait(lambda: self.monitor.limits is not None, self._service_timeout_s,
+                  "stage: no limits on stage/limits")  # fmt: skip
+        assert self.monitor.limits is not None
+        return self.monitor.limits
+
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""
         self._modulation = frequency_hz, duty
@@ -353,13 +360,6 @@ class ScanClient(InstrumentClient):
         "reconstruction/begin_scan": BeginScan,
         "reconstruction/end_scan": EndScan,
     }
-
-    def stage_limits(self) -> MoveLimits:
-        """Return the limits that the stage publishes; raise ``ScanFailure`` without any."""
-        self.wait(lambda: self.monitor.limits is not None, self._service_timeout_s,
-                  "stage: no limits on stage/limits")  # fmt: skip
-        assert self.monitor.limits is not None
-        return self.monitor.limits
 
     def begin_scan(self, request: ScanRequest) -> str:
         """Start to collect points; return the recording's folder, ``""`` without one.
