@@ -112,8 +112,6 @@ class _Pairs(NamedTuple):
     residual: Array
     sigma: Array
     """Shape (n,). Distance along the normal, and its standard deviation, mm."""
-    inside: NDArray[np.bool_]
-    """Whether both clouds have points all around."""
     centre: Array
     normal_noise: float
     """Standard deviation of a component of the normals."""
@@ -281,13 +279,16 @@ def _paired(surface: _Surface, source: _Shape, transform: Array, reach_mm: float
     noise = SIGMA_PER_MAD * float(np.median(difference[near])) / 2.0
     ratio = np.abs(residual) / sigma
     near &= ratio <= CUT_SIGMA * max(SIGMA_PER_MAD * float(np.median(ratio[near])), 1.0)
-    ours, moved, normals, residual, sigma, around = (
-        v[near] for v in (ours, moved, normals, residual, sigma, around)
+    # The normals of a rim hold a cloud where its surface would let it slide.
+    if np.count_nonzero(near & around) >= _PAIRS_MIN:
+        near &= around
+    ours, moved, normals, residual, sigma = (
+        v[near] for v in (ours, moved, normals, residual, sigma)
     )
     centre = moved.mean(axis=0)
     design = np.column_stack([np.cross(moved - centre, normals), normals])
     overlap = found / len(source.part.line)
-    return _Pairs(ours, moved, design, residual, sigma, around, centre, noise, overlap)
+    return _Pairs(ours, moved, design, residual, sigma, centre, noise, overlap)
 
 
 def _pose(source: _Shape, transform: Array, pairs: _Pairs, origin_mm: Array) -> Pose:
@@ -312,8 +313,7 @@ def _refuse_sliding(pairs: _Pairs, rms_sigmas: float) -> None:
 
     At a wrong pose the normals differ as if they were noise.
     """
-    used = pairs.inside if pairs.inside.any() else slice(None)
-    design, sigma = pairs.design[used], pairs.sigma[used]
+    design, sigma = pairs.design, pairs.sigma
     size = float(np.sqrt(np.mean(np.sum(design[:, :3] ** 2, axis=1)) / 2.0)) or 1.0
     scaled = design / np.array([size, size, size, 1.0, 1.0, 1.0]) / sigma[:, None]
     least, axes = np.linalg.eigh(scaled.T @ scaled)

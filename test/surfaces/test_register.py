@@ -74,6 +74,25 @@ def test_a_shift_by_half_a_pitch_is_not_drawn_to_the_grid():
     assert np.abs(error).max() < 0.02
 
 
+def test_a_wall_at_the_rim_of_a_steep_surface_does_not_hold_the_cloud():
+    """Its normals there are of the wall alone."""
+
+    def side(y, z):
+        waves = 3.0 * np.sin(z / 9.0) * np.cos(y / 11.0) + z**2 / 120.0
+        wall = 10.0 / (1.0 + np.exp((y - 2.0) / 0.3))
+        return 1300.0 - 2.5 * y - y**2 / 60.0 + waves - wall
+
+    start_mm = 3.4 * PITCH_Y
+    for seed in (0, 2, 4):
+        first, other = (
+            cloud(lambda y, z, low=low: side(y + low, z), sigma_mm=0.1, seed=seed + k)
+            for k, low in enumerate((0.0, start_mm))
+        )
+        pose = register(first, other)
+        error = np.concatenate([pose.rotation_deg, pose.shift_mm - [0.0, start_mm, 0.0]])
+        assert np.abs(error / pose.sigmas).max() < 3.0
+
+
 @pytest.mark.parametrize(
     ("surface", "words"),
     [
