@@ -86,9 +86,9 @@ def bag_to_recording(
             chosen.setdefault("trigger_source", "stage")
         limits = {"start_mm": -POSITION_LIMIT_MM, "stop_mm": POSITION_LIMIT_MM}
         scan = _from_custom(path, custom, _SCAN)
-        begun = {"scan_id": path.stem, **limits, **scan.data, "state": "recording"}
-        full = replace(scan, data=begun)
-        log = validate(ScanLog, full, FormatError)
+        named = {"scan_id": path.stem, **limits, "state": "ended", **scan.data}
+        recorded = validate(ScanLog, replace(scan, data=named), FormatError)
+        log = replace(recorded, state="recording")
         build = calibration or _calibration(source)
         stream = PacketStream(build, Settings.from_file(chosen, path), 0.0, packet_period_s)
         stream.announcement_expected = False
@@ -105,7 +105,8 @@ def bag_to_recording(
             _play(source, stream, recorder, kinds)
             if not stream.packets:
                 raise FormatError(f"{path} has no packet with a laser state; give --frequency")
-            recorder.end(None)
+            # Lost packets are counted again.
+            recorder.end(None, "; ".join(replace(recorded, packets_lost=0).faults))
             lacking = recorder.wait(_DISK_S)
             if recorder.failure:
                 raise FormatError(recorder.failure)

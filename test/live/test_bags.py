@@ -22,7 +22,7 @@ from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
-from eschorty_ros.core.storage import load_recording
+from eschorty_ros.core.storage import ScanLog, load_recording
 from eschorty_ros.live import bag_files
 from eschorty_ros.live.bag_conversion import bag_to_recording, recording_to_bag
 
@@ -96,6 +96,23 @@ def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
     np.testing.assert_array_equal(points(again), expected)
     assert again.modulation == recording.modulation
     assert again.calibration == recording.calibration
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"reason": "camera: gone"}, "camera: gone"),
+        ({"reason": "disk", "packets_left_out": 2}, "2 packets are not recorded: disk"),
+        ({"state": "recording"}, "the recording was not ended"),
+    ],
+)
+def test_what_a_recording_lacks_is_in_that_of_its_bag(tmp_path, source, change, words):
+    log = ScanLog(scan_id="s", start_mm=10.0, stop_mm=20.0, **{"state": "ended", **change})
+    recording_to_bag(replace(source, scan=log), tmp_path / "bag")
+    bag_to_recording(tmp_path / "bag", tmp_path / "again")
+    again = load_recording(tmp_path / "again").scan
+    assert again.state == "ended"
+    assert again.reason.startswith(words)
 
 
 def test_an_interrupted_conversion_leaves_no_bag(tmp_path, source):
