@@ -179,8 +179,12 @@ class ScanServices:
         if fault:
             self._sender, self._had_client = None, False
             self._node.get_logger().warning(f"{scan_id} was left open ({fault}); ending it")
-            end = partial(self._begin_end, scan_id, f"left open ({fault})", lambda _: None)
-            self._in_worker(end, 0.0)
+            self._in_worker(partial(self._end_left_open, scan_id, f"left open ({fault})"), 0.0)
+
+    def _end_left_open(self, scan_id: str, reason: str) -> None:
+        # A client that waits for the end may have begun it meanwhile.
+        if self._ended is None:
+            self._begin_end(scan_id, reason, lambda _: None)
 
     def _begin_end(self, scan_id: str, reason: str, done: Callable[[ScanReport], None]) -> None:
         self._ended_s = time.monotonic()

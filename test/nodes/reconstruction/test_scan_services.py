@@ -2,6 +2,7 @@
 
 import math
 import os
+import subprocess
 import time
 from types import SimpleNamespace
 
@@ -14,6 +15,11 @@ from ros_process import NodeProcess, Observer, Remap, nodes_here
 from std_msgs.msg import Header
 from waiting import wait_until
 
+from eschorty_ros.control.heartbeat import place
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.live.pipeline import Pipeline
 from eschorty_ros.nodes.reconstruction import scan_services
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
@@ -176,6 +182,38 @@ def test_the_end_of_a_scan_is_answered_within_one_wait(monkeypatch):
         wait_until(answer.done, "the answer")
         assert answer.result().message.startswith("scan 'long' is not assembled after 2 s")
         assert time.monotonic() - begun_s < 3.0
+
+
+def test_the_check_of_the_client_leaves_the_end_to_the_client_that_waits_for_it():
+    """Both may find the scan open before the worker begins to end it."""
+    build = load_calibration("config_3")
+    pipeline = Pipeline(build, Settings(), 1.0, 1.0, 1.0)
+    pipeline.begin_scan("open", 0.0, 100.0)
+    jobs = []
+
+    def in_worker(job, timeout_s):
+        jobs.append(job)
+        wait_until(lambda: not timeout_s or len(jobs) == 0, "the worker")
+        return True, ""
+
+    with Observer() as observer, subprocess.Popen(["true"]) as ended:
+        ended.wait()
+        services = ScanServices(
+            observer.node, pipeline, lambda: ("", False), in_worker, lambda: True, 0.0,
+            lambda _: None, lambda *_: None,
+        )  # fmt: skip
+        client = observer.node.create_client(EndScan, "reconstruction/end_scan")
+        answer = client.call_async(EndScan.Request(scan_id="open"))
+        wait_until(lambda: len(jobs) == 1, "the end")
+        heartbeats = observer.publisher(Header, CLIENT_HEARTBEAT, qos.heartbeat())
+        heartbeats.publish(Header(frame_id=f"{place()} {ended.pid}"))
+        wait_until(lambda: len(jobs) == 2, "the check of the client")
+        for job in jobs:
+            job()
+        jobs.clear()
+        services.finish()
+        wait_until(answer.done, "the answer")
+        assert answer.result().success
 
 
 def test_a_reconstruction_on_its_way_out_reports_at_once_that_it_stops():
