@@ -69,21 +69,34 @@ class LazyGroup(click.Group):
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")
-        try:
-            with _ended_by_signals():
-                return super().invoke(ctx)
-        except EschortyError as error:
-            raise StatedFailure(str(error)) from error
-        except BrokenPipeError:
-            # The reader of the output closed it; click ends without a message.
-            raise
-        except OSError as error:
-            raise StatedFailure(_unusable(error)) from error
-        except MemoryError as error:
-            raise StatedFailure(f"not enough memory: {error}; end other programs") from error
-        except KeyboardInterrupt:
-            click.echo("eschorty: interrupted", err=True)
-            ctx.exit(INTERRUPTED)
+        with _stated_failures():
+            try:
+                with _ended_by_signals():
+                    return super().invoke(ctx)
+            except KeyboardInterrupt:
+                click.echo("eschorty: interrupted", err=True)
+                ctx.exit(INTERRUPTED)
+
+    def make_context(self, *args: Any, **extra: Any) -> click.Context:
+        """Read the arguments; ``--help`` and ``--version`` print here."""
+        with _stated_failures():
+            return super().make_context(*args, **extra)
+
+
+@contextlib.contextmanager
+def _stated_failures() -> Iterator[None]:
+    """Turn the errors of the package, of files and of memory into one line."""
+    try:
+        yield
+    except EschortyError as error:
+        raise StatedFailure(str(error)) from error
+    except BrokenPipeError:
+        # The reader of the output closed it; click ends without a message.
+        raise
+    except OSError as error:
+        raise StatedFailure(_unusable(error)) from error
+    except MemoryError as error:
+        raise StatedFailure(f"not enough memory: {error}; end other programs") from error
 
 
 def _open_closed_streams() -> None:

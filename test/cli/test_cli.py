@@ -70,6 +70,16 @@ def without_ros(*arguments, **environment):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_a_full_disk_is_one_line_for_what_the_group_prints(option):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", "from eschorty_ros.cli import main; main()",
+                               option], stdout=full, stderr=subprocess.PIPE, text=True,
+                              timeout=300)  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+    assert "No space left on device" in done.stderr
+
+
 def test_without_ros_a_scan_is_one_line_that_gives_the_remedy():
     done = without_ros("scan")
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
