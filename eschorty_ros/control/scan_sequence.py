@@ -9,10 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import pairwise
+from pathlib import Path
 from typing import Protocol
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+from eschorty_ros.core.storage import EVENTS_FILE
 from eschorty_ros.live.sweep_coverage import COMPLETE, PASSES_MAX
 
 _FAILED_DRAIN_S = 5.0
@@ -394,11 +396,19 @@ def _finish(
     outcome.attempt(end_scan)
     summary = outcome.summary
     if summary is begun and begun.recording:
-        outcome.message += (
-            f"; `eschorty reconstruct {shlex.quote(begun.recording)}` makes points of what was "
-            "recorded until then"
-        )
+        outcome.message += f"; {_use_of(Path(begun.recording))}"
     if outcome.end is End.SUCCEEDED and not (
         summary.points and summary.completeness >= settings.completeness_min
     ):
         outcome.end = End.ABORTED
+
+
+def _use_of(recording: Path) -> str:
+    """Return what can be done with the recording of a reconstruction that has ended."""
+    # One of another host cannot be seen here.
+    if recording.is_dir() and not (recording / EVENTS_FILE).is_file():
+        return "no packet had come, so there is nothing to reconstruct"
+    return (
+        f"`eschorty reconstruct {shlex.quote(str(recording))}` makes points of what was recorded "
+        "until then"
+    )

@@ -139,6 +139,18 @@ def test_a_reconstruction_that_has_ended_leaves_its_recording_with_the_remedy():
     assert outcome.summary.recording == FOLDER
 
 
+def test_a_reconstruction_that_ends_before_its_first_packet_leaves_nothing_to_reconstruct(tmp_path):
+    gone = ScanFailure("reconstruction: process 7 is gone; the scan ends")
+    instrument = RecordingInstrument(("end_scan", 1), gone)
+    instrument.begin_scan = lambda request: str(tmp_path)
+    message = run_scan(instrument, REQUEST, SETTINGS).message
+    assert message == f"{gone}; no packet had come, so there is nothing to reconstruct"
+    (tmp_path / "events.raw").touch()
+    instrument = RecordingInstrument(("end_scan", 1), gone)
+    instrument.begin_scan = lambda request: str(tmp_path)
+    assert f"`eschorty reconstruct {tmp_path}`" in run_scan(instrument, REQUEST, SETTINGS).message
+
+
 def test_the_reason_of_an_early_end_reaches_the_recording():
     instrument, ends = RecordingInstrument(("move", 2), ScanFailure("camera: gone")), []
     instrument.end_scan = lambda *values: ends.append(values) or ScanSummary(points=5)
