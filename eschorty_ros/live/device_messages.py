@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from eschorty_ros.core.base.numbers import number
 from eschorty_ros.core.clocks import PulseTrain
-from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
 
 MM_PER_M = 1e3
 _OUTPUT_ON = 1
@@ -35,7 +35,8 @@ def laser_settings(state: Any) -> LaserSettings:
 
     Raises ``ArgumentError`` when frequency, duty or waveform is out of range.
     """
-    modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
+    frequency_hz = number("frequency", state.frequency, FREQUENCY_MIN_HZ, FREQUENCY_MAX_HZ)
+    modulation = Modulation(frequency_hz, float(state.duty), str(state.waveform))
     on = state.output == _OUTPUT_ON
     return LaserSettings(
         modulation,

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from eschorty_ros.action import Calibrate
+from eschorty_ros.core.base.numbers import number, positive
 from eschorty_ros.core.calibration import CalibrationReport, KnownTarget
 from eschorty_ros.core.optics import PARAMETERS, Calibration
 from eschorty_ros.live.calibration_capture import CaptureRequest, Sweep
@@ -19,7 +20,7 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_
 def request_from_goal(goal: Any) -> CaptureRequest:
     """Return the request of a ``Calibrate`` goal.
 
-    Raises ``ArgumentError`` for a target whose range or size is not positive.
+    Raises ``ArgumentError`` for a target whose range or size cannot be.
     """
     sweep = None
     if goal.sweep_speed != 0.0:
@@ -40,6 +41,10 @@ def request_from_goal(goal: Any) -> CaptureRequest:
 
 
 def _known_target(target: Any) -> KnownTarget:
+    name = f"target {target.label}: " if target.label else ""
+    positive(f"{name}range", target.range)
+    number(f"{name}range_sigma", target.range_sigma, 0.0)
+    number(f"{name}size", target.size, 0.0)
     return KnownTarget(
         mm_from_m(target.range),
         mm_from_m(target.range_sigma),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from eschorty_ros.control.calibration_sequence import CAPTURE_MAX_S
+from eschorty_ros.control.scan_sequence import check_laser
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.core.calibration import METHODS
@@ -60,6 +61,7 @@ def modulation_override(values: Mapping[str, Any]) -> Modulation | None:
     """Return the modulation in the parameters, ``None`` when the laser node's is to be used."""
     if not values["frequency"]:
         return None
+    check_laser(values["frequency"], values["duty"])
     return Modulation(values["frequency"], values["duty"], values["waveform"])
 
 

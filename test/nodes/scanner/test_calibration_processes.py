@@ -335,7 +335,7 @@ def test_bad_goals_are_refused(bench: CalibrationBench) -> None:
     one = CalibrationTarget(range=1.0)
     cases = (
         ({"targets": [one]}, ("targets holds 1",)),
-        ({"targets": [one, CalibrationTarget(range=-1.0)]}, ("range_mm is -1000",)),
+        ({"targets": [one, CalibrationTarget(range=-1.0)]}, ("range is -1",)),
         ({"method": "magic"}, ("magic", "paper")),
         ({"capture_time": 0.0}, ("capture_time", "0 s")),
         ({"frequency": 5.0}, ("frequency", "5 Hz")),
