@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,13 @@ from eschorty_ros.core.clocks import PulseTrain, SensorClock, StageTrack
 from eschorty_ros.core.evt3 import WRAP_US, first_time_high_us
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.core.reconstruction import (
+    Profiles,
+    Reconstructor,
+    Settings,
+    cause_of_few,
+    without_modulation,
+)
 from eschorty_ros.live.light_warnings import LightWarnings
 from eschorty_ros.live.packet_times import GAP_NS, Packet, first_time_us, overtaken, skips_time
 from eschorty_ros.live.scan_recorder import ScanRecorder
@@ -167,6 +173,20 @@ class PacketStream:
             ]
         laser_hz = 0.0 if self._reported is None else self._reported[0].frequency_hz
         return self._warnings.lines(self._reconstructor, self._settings, laser_hz)
+
+    def cause_of_no_points(self, before: Mapping[str, int]) -> str:
+        """Return what the counts since they were ``before`` show of a scan without points."""
+        counts = self.counters
+        counts.subtract(before)
+        if counts["points_without_time"]:
+            return (
+                f"{counts['points_without_time']:,} points had no time, as the camera's clock was "
+                "not known; look at the stamps of camera/events"
+            )
+        dark = without_modulation(counts["events"], self.frequency_hz)
+        # Without a phase of the laser no event gets into a column.
+        modulated = counts["events_binned"] > 0
+        return cause_of_few(self._settings, counts, 0, dark, modulated) or dark
 
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from operator import sub
 from typing import NamedTuple
@@ -19,7 +20,6 @@ from eschorty_ros.core.reconstruction import (
     pass_lag,
     place,
     take_off_lag,
-    without_modulation,
 )
 from eschorty_ros.core.storage import Points
 from eschorty_ros.live.calibration_capture import Capture
@@ -43,7 +43,8 @@ class ScanReport:
 
     ``refusal`` is the reason why the last of ``packets_refused`` was refused. ``profiles_max`` is
     the number that the stage's time between start and stop allows, with rests; ``clock_step_ns``
-    is how far the computer's clock was set meanwhile.
+    is how far the computer's clock was set meanwhile. ``cause_of_no_points`` is named where there
+    are no warnings.
     """
 
     scan: AssembledScan
@@ -55,7 +56,7 @@ class ScanReport:
     points_outside: int
     points_over_limit: int
     profiles_expected: int
-    frequency_hz: float
+    cause_of_no_points: str
     warnings: tuple[str, ...] = ()
     pass_lag: PassLag | None = None
     packets_refused: int = 0
@@ -149,8 +150,7 @@ class ScanReport:
 
     def _cause_of_empty(self) -> str:
         if not (self.events and self.points_outside):
-            dark = without_modulation(self.events, self.frequency_hz)
-            return f"no points: {'; '.join(self.warnings) or dark}"
+            return f"no points: {'; '.join(self.warnings) or self.cause_of_no_points}"
         if not self.profiles_expected:
             return "no points: the stage has not moved by a profile between start and stop"
         return (
@@ -213,6 +213,7 @@ class Pipeline:
         self._clock_step_ns = 0
         self._coverage = SweepCoverage(0.0, 0.0)
         self._counts_at_begin = _Counts(0, 0, 0, 0, 0, 0)
+        self._counters_at_begin: Counter[str] = Counter()
 
     @property
     def scan_id(self) -> str:
@@ -325,6 +326,7 @@ class Pipeline:
                 recorder.stage(int(t_us) * NS_PER_US, float(position_mm))
         self.stream.begin_scan(recorder)
         self._counts_at_begin = self._counts()
+        self._counters_at_begin = self.stream.counters
 
     def set_capture(self, capture: Capture | None) -> None:
         """Start to feed a calibration's capture, or stop with ``None``.
@@ -378,7 +380,7 @@ class Pipeline:
             points_outside=buffer.points_outside,
             points_over_limit=buffer.points_over_limit,
             profiles_expected=self._coverage.profiles(self.stream.profile_rate_hz),
-            frequency_hz=self.stream.frequency_hz,
+            cause_of_no_points=self.stream.cause_of_no_points(self._counters_at_begin),
             warnings=tuple(self.stream.warnings),
             pass_lag=lag,
             refusal=self._refusal,

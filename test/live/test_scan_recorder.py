@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -164,3 +165,10 @@ def test_two_marks_of_one_place_count_both(source):
     packets = list(timed_packets(RawReader(source.events_path), marks))
     assert sum(packet.packets_lost for packet in packets) == 3
     assert sum(packet.laser_on for packet in packets) == 1
+
+
+def test_a_scan_whose_points_are_lost_names_the_loss(source, tmp_path):
+    settings = replace(recorded_scan.SETTINGS, events_min=1000)
+    report = LiveScan(source, tmp_path / "rec", settings=settings).run()
+    assert not report.warnings
+    assert "columns have fewer events than events_min = 1000; lower it" in report.message

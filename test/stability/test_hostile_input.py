@@ -504,7 +504,7 @@ NOT_FOR_USERS = {
     "reconstruction.region_window",
     "storage.finite_points", "storage.height_map", "storage.is_cloud",
     "reconstruction.PassLag", "reconstruction.pass_lag", "reconstruction.take_off_lag",
-    "reconstruction.without_modulation",
+    "reconstruction.cause_of_few", "reconstruction.without_modulation",
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionFit",

@@ -43,12 +43,12 @@ def source(folder):
 class LiveScan:
     """Packets with late stamps, seq from 7 on; those of ``lost`` are missing."""
 
-    def __init__(self, recording, folder, lost=(), **options):
+    def __init__(self, recording, folder, lost=(), settings=SETTINGS, **options):
         log = ScanLog(scan_id="s", start_mm=LIMITS_MM[0], stop_mm=LIMITS_MM[1], stage_gap_s=0.5)
-        build, settings = recording.calibration, asdict(SETTINGS)
-        self.recorder = ScanRecorder(folder, log, build, settings, **options)
+        build = recording.calibration
+        self.recorder = ScanRecorder(folder, log, build, asdict(settings), **options)
         assert self.recorder.made(5.0) == ""
-        self.pipeline = Pipeline(recording.calibration, SETTINGS, 0.0, 0.5, 6.0)
+        self.pipeline = Pipeline(build, settings, 0.0, 0.5, 6.0)
         self.pipeline.stream.announcement_expected = False
         self.modulation = Modulation(70.0)
         self.packets = []

@@ -1,7 +1,7 @@
 """From the camera's bytes to profiles and points."""
 
 from eschorty_ros.core.reconstruction.live_cloud import LIVE_DTYPE, LIVE_SPAN_NS, live_points
-from eschorty_ros.core.reconstruction.missing_points import without_modulation
+from eschorty_ros.core.reconstruction.missing_points import cause_of_few, without_modulation
 from eschorty_ros.core.reconstruction.offline import (
     Result,
     reconstruct_recording,
@@ -32,6 +32,7 @@ __all__ = [
     "SensorWindow",
     "Settings",
     "add_stage",
+    "cause_of_few",
     "live_points",
     "pass_lag",
     "place",

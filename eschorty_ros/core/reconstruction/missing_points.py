@@ -10,7 +10,6 @@ from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED
 from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, FEW_SHARE, periods_max
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.stream_faults import FEWER_EVENTS, is_unreadable
-from eschorty_ros.core.storage import Points
 
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
@@ -212,27 +211,27 @@ def without_modulation(events: int, frequency_hz: float) -> str:
     )
 
 
-def few_points(
-    settings: Settings, counters: Mapping[str, int], points: Points, dark: str, modulated: bool
-) -> list[str]:
-    """Return the largest loss where it left few points or none, ``dark`` where there is none."""
+def cause_of_few(
+    settings: Settings, counters: Mapping[str, int], points: int, dark: str, modulated: bool
+) -> str:
+    """Return the largest loss where it left few points or none, ``dark`` where there is none.
+
+    It is ``""`` where the reconstructor has a line for it, or points are not few.
+    """
     outside = 2 * max(counters["events_gated"], counters["events_outside_roi"])
     if outside > counters["events"] or is_unreadable(counters) or _other_light(counters):
-        # The reconstructor has a line for it.
-        return []
+        return ""
     lost = max(_LOSSES, key=lambda name: counters[name])
-    if modulated and not len(points) and counters["columns_unmodulated"] > counters[lost]:
-        # It has one for this, too.
-        return []
+    if modulated and not points and counters["columns_unmodulated"] > counters[lost]:
+        return ""
     if 2 * counters["events_filtered"] > counters["events"]:
         words, count = _FILTERED, counters["events_filtered"]
     else:
         words, count = _LOSSES[lost], counters[lost]
         unused = counters["events_binned"] - counters["events_used"]
         # Background alone leaves columns with few events, too.
-        if len(points) and lost in _WITHOUT_POINT and unused < Settings().events_min * count:
-            return []
-    if len(points) and count <= _LOST_PER_POINT * len(points):
-        return []
-    cause = f"{count:,} {words.format(settings)}" if modulated and count else dark
-    return [f"{len(points):,} points: {cause}"]
+        if points and lost in _WITHOUT_POINT and unused < Settings().events_min * count:
+            return ""
+    if points and count <= _LOST_PER_POINT * points:
+        return ""
+    return f"{count:,} {words.format(settings)}" if modulated and count else dark

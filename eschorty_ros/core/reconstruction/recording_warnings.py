@@ -10,7 +10,7 @@ import numpy as np
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
-from eschorty_ros.core.reconstruction.missing_points import few_points, without_modulation
+from eschorty_ros.core.reconstruction.missing_points import cause_of_few, without_modulation
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.stage_faults import sampling_faults, stage_faults
 from eschorty_ros.core.storage import Points, Recording
@@ -131,7 +131,8 @@ def recording_warnings(
     if without_stage or ((wrong_frequency or found) and len(points)):
         return lines
     dark = without_modulation(counters["events"], stated_hz)
-    return [*lines, *few_points(settings, counters, points, dark, shown_hz is not None)]
+    cause = cause_of_few(settings, counters, len(points), dark, shown_hz is not None)
+    return [*lines, f"{len(points):,} points: {cause}"] if cause else lines
 
 
 def _duty_faults(modulation: Modulation, shown: float | None) -> list[str]:
