@@ -127,12 +127,27 @@ def recording_warnings(
             f"{len(points) + without_stage:,} points have no stage position; give the stage log "
             "of the same time"
         )
-    lines = [*wrong_frequency, *of_stream, *found]
+    lines = [*wrong_frequency, *of_stream, *found, *_unused_edges(recording, settings, counters)]
     if without_stage or ((wrong_frequency or found) and len(points)):
         return lines
     dark = without_modulation(counters["events"], stated_hz)
     cause = cause_of_few(settings, counters, len(points), dark, shown_hz is not None)
     return [*lines, f"{len(points):,} points: {cause}"] if cause else lines
+
+
+def _unused_edges(
+    recording: Recording, settings: Settings, counters: Mapping[str, int]
+) -> list[str]:
+    """Return a line about edges of the stage; in a scan recorded with them they set the clock."""
+    edges = counters["decoder_triggers"]
+    before = recording.settings.get("trigger_source")
+    if not edges or settings.trigger_source != "stage" or before == "stage":
+        return []
+    return [
+        f"{edges:,} edges at the trigger input are not used: trigger_source is stage, whose edges "
+        "set the clock of a live scan, and stage.csv has the sensor's time already; where they are "
+        "the laser's, set it to laser"
+    ]
 
 
 def _duty_faults(modulation: Modulation, shown: float | None) -> list[str]:

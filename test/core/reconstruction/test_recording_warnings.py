@@ -7,7 +7,7 @@ import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
 from eschorty_ros.core.clocks import StageTrack
-from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.evt3 import Decoder, Encoder
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
@@ -343,3 +343,25 @@ def test_what_no_setting_can_mend_is_an_error(recording):
     track.append(samples["t_us"], samples["position_mm"])
     with pytest.raises(FormatError, match="moves at 50 m/s; write t_us in microseconds"):
         reconstruct_recording(replace(recording, stage=track, stage_samples=samples))
+
+
+def test_edges_of_the_stage_that_a_recording_does_not_use_are_counted(recording, tmp_path):
+    """In a scan recorded with them they have set the clock."""
+    reader, decoder = RawReader(recording.events_path), Decoder(96, 720)
+    events = decoder.decode(b"".join(reader.chunks(1 << 20)))
+    edges_us = np.linspace(events.t[0], events.t[-1], 30).astype(np.int64)
+    path = tmp_path / "edges.raw"
+    with RawWriter(path, 96, 720) as writer:
+        writer.write(Encoder().encode(
+            events.t, events.x, events.y, events.p,
+            trigger_t=edges_us, trigger_edge=np.ones(30, np.uint8),
+        ))  # fmt: skip
+    wired = replace(recording, events_path=path)
+    warnings = reconstruct_recording(wired, Settings(trigger_source="stage")).warnings
+    assert any(line.startswith("30 edges at the trigger input are not used") for line in warnings)
+    for other, settings in (
+        (replace(wired, settings={"trigger_source": "stage"}), Settings(trigger_source="stage")),
+        (wired, Settings(trigger_source="none")),
+        (recording, Settings(trigger_source="stage")),
+    ):
+        assert not any("edges" in line for line in reconstruct_recording(other, settings).warnings)
