@@ -94,6 +94,7 @@ class PacketStream:
         self._reported: tuple[Modulation, int | None] | None = None
         self._override: Modulation | None = None
         self._on_since_ns: int | None = None
+        self._lit_rate_hz: float | None = None
         self._reconstructor: Reconstructor | None = None
         self._wraps = 0
         self._next_seq: int | None = None
@@ -134,10 +135,12 @@ class PacketStream:
 
     @property
     def profile_rate_hz(self) -> float:
-        """Return the profiles per second of the modulation, 0 while that is unknown.
+        """Return the profiles per second of the light that is on or was last, 0 while unknown.
 
         Until the stream has shown how many periods make a profile, it is one.
         """
+        if self._lit_rate_hz is not None:
+            return self._lit_rate_hz
         every = 0 if self._reconstructor is None else self._reconstructor.periods_per_profile
         return self.frequency_hz / (every or self._settings.periods_per_profile or 1)
 
@@ -221,6 +224,7 @@ class PacketStream:
         if recorder is not None:
             self._renew()
         self._warnings.restart(self._reconstructor)
+        self._lit_rate_hz = None
         if self._zero_ended and self._epoch is not None and self._epoch.clock.exact:
             self._retire()
             self._epoch = None
@@ -243,6 +247,8 @@ class PacketStream:
         new_light = on_since_ns is not None and self._on_since_ns is None
         if on_since_ns is None and self._on_since_ns is not None:
             self._warnings.end(self.warnings)
+            # What is set from here on is for the next light.
+            self._lit_rate_hz = self.profile_rate_hz
         self._on_since_ns = on_since_ns
         before, self._reported = self._laser, (modulation, epoch_ns)
         self._follow_laser(before)
@@ -250,6 +256,7 @@ class PacketStream:
             self._reconstructor.restart_phase()
         if new_light:
             self._warnings.restart(self._reconstructor)
+            self._lit_rate_hz = None
         if self._recorder is not None and switched_on:
             self._recorder.laser_on()
 

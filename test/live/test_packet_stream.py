@@ -630,6 +630,29 @@ def test_a_scan_with_more_profiles_than_its_time_allows_is_not_complete(streams)
     assert ("more than there can be" in report.message) == (streams > 1)
 
 
+def test_a_modulation_that_is_set_after_the_light_has_ended_changes_no_count_of_a_scan():
+    reports = []
+    for after in (MODULATION, Modulation(140.0)):
+        pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 6.0)
+        epoch_ns = ZERO_NS + EDGE_US * 1000
+        pipeline.stream.announce_zero(ZERO_NS)
+        pipeline.begin_scan("s", 0.0, 1.0)
+        pipeline.stream.set_laser(MODULATION, epoch_ns, on_since_ns=ZERO_NS)
+        for packet in packets(line()):
+            pipeline.add_packet(packet, 0.0)
+        pipeline.process(0.0)
+        pipeline.stream.set_laser(MODULATION, epoch_ns)
+        pipeline.stream.set_laser(after, None)
+        for k in range(-2, 15):
+            pipeline.add_stage(ZERO_NS + k * 10_000_000, 0.01 + k / 12.0)
+        pipeline.close_period("s", 0.0)
+        pipeline.place(0.0)
+        reports.append(pipeline.end_scan())
+    before, changed = reports
+    assert changed.profiles_expected == before.profiles_expected > 0, "seed 3"
+    assert (changed.completeness, changed.message) == (before.completeness, before.message)
+
+
 def test_the_report_of_a_scan_has_the_warnings_of_its_stream():
     pipeline = Pipeline(CALIBRATION, Settings(line_width_px=6.0), 1.0, 0.0, 6.0)
     pipeline.stream.announce_zero(ZERO_NS)
