@@ -66,7 +66,7 @@ def command(path: Path) -> None:
             pairs(f"{path}: a bag", {topic: f"{n:,}" for topic, n in bag.counts().items()})
     elif path.is_dir():
         recording = load_recording(path)
-        rows = {"calibration": _in_short(recording.calibration)}
+        rows = {"calibration": _in_short(recording.calibration.label, recording.calibration)}
         rows |= _laser(recording.modulation) | _stage(recording.stage_samples)
         if recording.scan is not None:
             rows |= _scan(recording.scan)
@@ -101,15 +101,15 @@ def command(path: Path) -> None:
         )
 
 
-def _in_short(calibration: Calibration) -> str:
+def _in_short(name: str, calibration: Calibration) -> str:
     near, far = calibration.model().range_limits_mm
-    return f"{calibration.name} ({near:.1f} to {far:.1f} mm)"
+    return f"{name} ({near:.1f} to {far:.1f} mm)"
 
 
 def _calibration(calibration: Calibration) -> dict[str, str]:
     given = {key: value for key, value in calibration.as_dict().items() if key in _SHOWN}
     return {
-        "build": _in_short(calibration),
+        "build": _in_short(calibration.name, calibration),
         "sensor": f"{calibration.columns} x {calibration.rows}, {calibration.pixel_um:g} um",
         "k_mm": f"{calibration.object_scale_mm:.6g}",
         **{key: str(value) for key, value in given.items()},

@@ -433,6 +433,14 @@ def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     assert "peak rate" in good("info", recording / "events.raw")
 
 
+def test_info_names_the_fit_that_a_recording_was_made_with(recording, tmp_path):
+    copy = shutil.copytree(recording, tmp_path / "rec")
+    with (copy / "calibration.yaml").open("a") as file:
+        file.write("id: config_3-2026-11-30-0a1b2c3d\n")
+    assert "config_3-2026-11-30-0a1b2c3d (784.6" in good("info", copy)
+    assert "config_3 (784.6" in good("info", copy / "calibration.yaml")
+
+
 def test_info_names_what_it_shows_where_a_file_is_something_else(tmp_path):
     (tmp_path / "page.html").write_text("<html>")
     result = run("info", tmp_path / "page.html")

@@ -97,6 +97,11 @@ class Calibration(Schema):
     condition_number: Annotated[float, Within(low=1.0)] | None = None
     range_mm: tuple[float, float] | None = None
 
+    @property
+    def label(self) -> str:
+        """Return the id of a fit, the name of a design."""
+        return self.id or self.name
+
     def _conflicts(self) -> Iterator[tuple[str, str]]:
         for key, name in (("name", self.name), ("id", self.id)):
             if name is not None and not is_bare_name(name):
@@ -226,7 +231,7 @@ def save_named_calibration(
     Raises ``CalibrationError`` when the name is no bare name, or stands for something other than a
     regular file. Raises ``ArgumentError`` when the file cannot be written.
     """
-    path = _named_path(folder, (calibration.id or calibration.name) if name == "" else name)
+    path = _named_path(folder, calibration.label if name == "" else name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):

@@ -86,7 +86,7 @@ class ActiveCalibration:
             self._use(calibration)
             self.calibration = calibration
             self._publish(file)
-        self._node.get_logger().info(f"calibration {calibration.id or calibration.name}: {file}")
+        self._node.get_logger().info(f"calibration {calibration.label}: {file}")
 
     def _publish(self, file: str) -> None:
         now_ns = self._node.get_clock().now().nanoseconds

@@ -124,7 +124,7 @@ class ReconstructionNode(Node):
         )
         modulation = f"{self._override.frequency_hz:g} Hz" if self._override else laser
         return (
-            f"calibration {self.calibration.name}, modulation {modulation}, trigger source "
+            f"calibration {self.calibration.label}, modulation {modulation}, trigger source "
             f"{self.parameters['trigger_source']}, events {events}, stage {odom}"
         )
 
