@@ -41,5 +41,5 @@ class StampAges:
         late = "" if age_s < 0.0 else ", or run less beside an emulated instrument"
         raise ScanFailure(
             f"{self._name}: its stamps are {difference} this host's clock; "
-            f"synchronise the hosts' clocks{late}"
+            f"synchronise the hosts' clocks, leave use_sim_time out{late}"
         )
