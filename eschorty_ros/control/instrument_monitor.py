@@ -222,7 +222,7 @@ class InstrumentMonitor:
         if _age_s(self._reported_s["reconstruction"]) > _STALE_S:
             return "reconstruction: it does not report"
         if not self._camera_present():
-            return "camera: its node is gone, no events"
+            return "camera: no publisher of camera/events; look at the log of its node"
         if self.reconstruction and math.isfinite(self.reconstruction.packet_age_s):
             busy = "reconstruction: packets arrive, but it processes none"
             return f"{busy}; look at the computer's load and at its log"

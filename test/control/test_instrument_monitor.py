@@ -67,6 +67,15 @@ def test_without_progress_the_component_that_lacks_is_named_with_a_remedy():
         InstrumentMonitor(lambda: True).check_progress(3.0)
 
 
+def test_a_camera_that_does_not_publish_yet_is_not_said_to_be_gone():
+    subject = InstrumentMonitor(lambda: False)
+    subject.update_reconstruction(ReconstructionStatus(0, 0.0, 0, 0, "", math.nan), 0.01)
+    lacks = "camera: no publisher of camera/events"
+    assert subject.cause_of_no_progress().startswith(lacks)
+    with pytest.raises(ScanFailure, match=f"{lacks} for 3 s; look at the log of its node"):
+        subject.check_progress(3.0)
+
+
 def test_a_drain_ends_although_there_is_progress():
     subject = monitor()
     waiting = PacedWaiting("scanner", subject, lambda: 10**18, lambda: True, 3.0)
