@@ -94,9 +94,19 @@ def _stated_failures() -> Iterator[None]:
         # The reader of the output closed it; click ends without a message.
         raise
     except OSError as error:
+        _drop_unprinted()
         raise StatedFailure(_unusable(error)) from error
     except MemoryError as error:
         raise StatedFailure(f"not enough memory: {error}; end other programs") from error
+
+
+def _drop_unprinted() -> None:
+    """Drop what a full disk does not take, on which Python would fail again when it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), sys.stdout.fileno())
 
 
 def _open_closed_streams() -> None:

@@ -70,11 +70,13 @@ def without_ros(*arguments, **environment):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("option", ["--help", "--version"])
-def test_a_full_disk_is_one_line_for_what_the_group_prints(option):
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["design"]])
+def test_a_full_disk_is_one_line(arguments, unbuffered):
     with open("/dev/full", "w") as full:
         done = subprocess.run([sys.executable, "-c", "from eschorty_ros.cli import main; main()",
-                               option], stdout=full, stderr=subprocess.PIPE, text=True,
+                               *arguments], stdout=full, stderr=subprocess.PIPE, text=True,
+                              env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
                               timeout=300)  # fmt: skip
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
     assert "No space left on device" in done.stderr
