@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.line.blinking import make_blink
 from eschorty_ros.core.line.columns import (
+    Columns,
     _append,
     _bin,
     _bin_all,
@@ -99,8 +100,19 @@ class ProfileAssembler:
 
     def _use(self, memory: Memory) -> None:
         self._memory, self._state = memory, memory.state
+        self._rows_max = memory.output.row.size - memory.rows.row.size
         self._boxed_memory = Boxed(memory)
-        self._boxed = Boxed(_Open(self._boxed_memory, Pointer(_end, self._boxed_memory)))
+        self._boxed = Boxed(
+            _Open(
+                columns=memory.columns,
+                gate=memory.gate.state,
+                state=memory.state,
+                counters=memory.counters,
+                rows_max=self._rows_max,
+                memory=self._boxed_memory,
+                end=Pointer(_end, self._boxed_memory),
+            )
+        )
 
     def restart(
         self, modulation: Modulation, every: int, edge_us: int, first: Arrays | None = None
@@ -219,10 +231,9 @@ class ProfileAssembler:
         - ``edges``: Beginnings of periods before the span's end.
         """
         cut = Cut(0, 0)
-        rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
             cut = Cut(*_merge_words(words, cut, decoder.boxed, span, edges, self._boxed))
-            full, crowded = self._widen(), self._state["rows"] > rows_max
+            full, crowded = self._widen(), self._state["rows"] > self._rows_max
             if crowded:
                 self._collect()
             if self.window_is_over or not (full or crowded):
@@ -260,10 +271,10 @@ class ProfileAssembler:
 
 
 @kernel
-def _count(events, refused, memory):
+def _count(events, period):
     """Count the events read of the open period."""
-    state, counters = memory.state, memory.counters
-    state.window += events
+    counters, refused = period.counters, period.columns.refused
+    period.state.window += events
     refusals = refused.over_limit + refused.outside_region + refused.gated
     counters.events_binned += events - refusals
     counters.events_over_column_limit += refused.over_limit
@@ -272,26 +283,33 @@ def _count(events, refused, memory):
 
 
 @kernel
-def _fill(events, first, limit_us, memory):
+def _fill(events, first, limit_us, period):
     """Sort the events before ``limit_us`` into the open period; return the index of the next."""
-    state = memory.state
+    state = period.state
     if state.status == CLOSED:
         i = first
         while i < events.t.size and events.t[i] < limit_us:
             i += 1
-        memory.counters.events_before_first_edge += i - first
+        period.counters.events_before_first_edge += i - first
         return i
     state.status = FILLED
-    columns, gate = memory.columns, memory.gate.state
-    end, state.full = _append(events, first, limit_us, state.edge_us, columns, gate)
+    end, state.full = _append(events, first, limit_us, state.edge_us, period.columns, period.gate)
     if not state.full:
-        _count(end - first, columns.refused, memory)
+        _count(end - first, period)
     return end
 
 
 class _Open(NamedTuple):
-    """Memory of the open period, and the kernel that ends it."""
+    """What the events of the open period change, and the kernel that ends it, with its memory.
 
+    ``rows_max`` is the number of rows that leaves room for another profile.
+    """
+
+    columns: Columns
+    gate: Any
+    state: Any
+    counters: Any
+    rows_max: int
     memory: Boxed
     end: Pointer
 
@@ -308,41 +326,40 @@ def _end(boxed):
 
 
 @kernel(inline="always")
-def _begin_period(edges, edge, period, memory):
+def _begin_period(edges, edge, period):
     """Close the open period and begin the next at an edge."""
-    state = memory.state
+    state = period.state
     if state.status == FILLED:
         if not period.end(period.memory):
             raise RuntimeError("a profile failed; the reason is above")
     elif state.status == EMPTY:
-        memory.counters.periods_empty += 1
+        period.counters.periods_empty += 1
     state.status = EMPTY
     state.edge_us = state.part_us = edges.t_us[edge]
     state.period = edges.period[edge]
 
 
 @kernel
-def _merge_part(events, edges, i, edge, drain, period, memory):
+def _merge_part(events, edges, i, edge, drain, period):
     """Merge events from ``i`` on, and with ``drain`` the edges after the last one."""
-    state, rows_max = memory.state, memory.output.row.size - memory.rows.row.size
-    t, edges_us = events.t, edges.t_us
+    state, t, edges_us = period.state, events.t, edges.t_us
     far = np.int64(1 << 62)
     while True:
         limit_us = edges_us[edge] if edge < edges_us.size else far
         if i < t.size and t[i] < limit_us:
-            i = _fill(events, i, limit_us, memory)
+            i = _fill(events, i, limit_us, period)
             if state.full:
                 return i, edge
         if edge == edges_us.size or (i == t.size and not drain):
             return i, edge
-        if state.status == FILLED and state.rows > rows_max:
+        if state.status == FILLED and state.rows > period.rows_max:
             return i, edge
         # In the dark many periods end at once.
         first, next_us = edge, t[i] if i < t.size else far
         while edge + 1 < edges_us.size and edges_us[edge + 1] <= next_us:
             edge += 1
-        _begin_period(edges, edge, period, memory)
-        memory.counters.periods_empty += edge - first
+        _begin_period(edges, edge, period)
+        period.counters.periods_empty += edge - first
         edge += 1
 
 
@@ -354,12 +371,11 @@ def _merge(held, new, edges, i, edge, boxed):
     remain when the output has no room for another profile.
     """
     period, size = boxed.content, held.t.size
-    memory = period.memory.content
     if i < size:
-        i, edge = _merge_part(held, edges, i, edge, False, period, memory)
+        i, edge = _merge_part(held, edges, i, edge, False, period)
         if i < size:
             return i, edge
-    i, edge = _merge_part(new, edges, i - size, edge, True, period, memory)
+    i, edge = _merge_part(new, edges, i - size, edge, True, period)
     return size + i, edge
 
 
@@ -382,10 +398,9 @@ def _copy(counts, numbers, other_counts, other_numbers):
 
 
 @kernel(_nrt=False)
-def _pass(words, cut, decoder, span, edges, period, memory, before):
+def _pass(words, cut, decoder, span, edges, period, before):
     """Decode words as `_merge_words`, without references; ``before`` is room to undo a part in."""
-    columns, gate, state = memory.columns, memory.gate.state, memory.state
-    rows_max = memory.output.row.size - memory.rows.row.size
+    columns, gate, state = period.columns, period.gate, period.state
     i, edge = np.uint64(cut.word), cut.edge
     state.over = 0
     while True:
@@ -409,7 +424,7 @@ def _pass(words, cut, decoder, span, edges, period, memory, before):
         i = end
         if events > 0:
             state.status = FILLED
-            _count(np.int64(events), columns.refused, memory)
+            _count(np.int64(events), period)
         if i == np.uint64(words.size) or words[i] >> 12 == EXT_TRIGGER:
             break
         if limit_us < end_us:
@@ -417,11 +432,11 @@ def _pass(words, cut, decoder, span, edges, period, memory, before):
             continue
         if edge == edges.t_us.size:
             break
-        if state.status == FILLED and state.rows > rows_max:
+        if state.status == FILLED and state.rows > period.rows_max:
             break
         filled = state.status == FILLED
         learning = state.known_half == 0
-        _begin_period(edges, edge, period, memory)
+        _begin_period(edges, edge, period)
         edge += 1
         learned = learning and state.known_half > 0
         if span.one_window and filled and (learned or state.window == 0):
@@ -438,6 +453,5 @@ def _merge_words(words, cut, boxed_decoder, span, edges, boxed):
     before a trigger. Words and edges remain when a column or the output has no room.
     """
     period, decoder = boxed.content, boxed_decoder.content
-    memory = period.memory.content
-    before = np.empty_like(memory.columns.counts), np.empty_like(decoder.numbers)
-    return _pass(words, cut, decoder, span, edges, period, memory, before)
+    before = np.empty_like(period.columns.counts), np.empty_like(decoder.numbers)
+    return _pass(words, cut, decoder, span, edges, period, before)
