@@ -77,6 +77,7 @@ TO_CONTROLLER: Final = {
         Layout("disconnect", 0x0002),
         Layout("request_info", 0x0005),
         Layout("stop_updates", 0x0012),
+        Layout("connect", 0x0018),
         Layout("request_bay", 0x0060, ("bay",)),
         Layout("set_enabled", 0x0210, ("channel", "state")),
         Layout("set_rack_trigger", 0x0260, _RACK_TRIGGER, "6H8iH"),

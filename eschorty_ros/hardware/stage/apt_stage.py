@@ -93,6 +93,7 @@ class AptStage:
     def _connect(self) -> None:
         # First: a controller that a program has left without it for long answers nothing before.
         self._link.call_every(lambda: _KEEP_ALIVE_S, self._keep_alive)
+        self._setup.send("connect")
         self._setup.send("stop_updates")
         # The program that used it before may have left it moving.
         self._setup.send("stop", mode=_PROFILED)

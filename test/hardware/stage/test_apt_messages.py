@@ -22,6 +22,7 @@ PULSES = {
 }
 
 PACKED = [
+    (apt.pack("connect", 0x50), oracle.hw_no_flash_programming(0x50, 1)),
     (apt.pack("disconnect", 0x50), oracle.hw_disconnect(0x50, 1)),
     (apt.pack("request_info", 0x11), oracle.hw_req_info(0x11, 1)),
     (apt.pack("stop_updates", BAY), oracle.hw_stop_updatemsgs(BAY, 1)),

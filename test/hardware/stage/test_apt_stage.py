@@ -290,6 +290,11 @@ def test_all_settings_are_written_at_each_connection(bench: AptBench) -> None:
         assert bench.sent(id), hex(id)
 
 
+def test_the_controller_gets_the_address_of_the_host_before_any_order(bench: AptBench) -> None:
+    ids = [data[:2].hex() for _, data in bench.port.written]
+    assert ids[:3] == ["9204", "1800", "1200"]
+
+
 @pytest.mark.parametrize("reserved_bytes", [0, 12])
 def test_answers_about_the_trigger_have_either_length(reserved_bytes: int) -> None:
     bench = AptBench(reserved_bytes=reserved_bytes)
