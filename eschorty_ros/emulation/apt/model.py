@@ -37,7 +37,7 @@ class AptModel:
     - ``late_ns``: Extra delay of each frame to the host, as a USB adapter adds.
     - ``on_plan``: Called with every new motion, in the clock's time.
     - ``sampled_pulses``: Trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
-    - ``reserved_bytes``: Reserved bytes at the end of a KBD101's answers about its trigger.
+    - ``reserved_bytes``: Reserved bytes at the end of its answers about the trigger.
     - ``seed``: Seed of random disturbances.
 
     Public attributes:
@@ -159,6 +159,8 @@ class AptModel:
                     self.axis.stop(at_ns, EMERGENCY_MM_S2)
             case "home" | "move_absolute" | "stop":
                 self._motion(name, values, at_ns)
+            case "set_rack_trigger" if values["channel"] != self._bay:
+                pass  # The number of the motor channel in this one, 1 in all others.
             case _ if name in SETTINGS:
                 self._set(name, values, at_ns)
             case _:

@@ -1,8 +1,9 @@
 """Messages of the Thorlabs APT protocol that a brushless stage needs: layouts, scaling, bits.
 
-Host-Controller Protocol Issue 15 for all but the trigger outputs, which it leaves out. Those of a
-KBD101 are as in the manufacturer's example for its serial port, with 12 reserved bytes at the end;
-those of the BBD30x racks are as a published BBD302 driver sends them. Unconfirmed on hardware.
+Thorlabs' Host-Controller Communications Protocol, issue 15 and that of December 2025, for all but
+the length of two messages. ``set_pulses`` of a KBD101 has the 12 reserved bytes at its end that the
+manufacturer's example for the serial port has; ``set_rack_trigger`` ends after one reserved word
+of four, as a published BBD302 driver sends it. Unconfirmed on hardware.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ _INCOMING = (
     Layout("bay", 0x0061, ("bay", "state")),
     Layout("error", 0x0080),
     Layout("error_text", 0x0081, ("message", "code", "text"), "2H64s"),
-    Layout("rack_trigger", 0x0262, _RACK_TRIGGER, "6H8iH"),
+    Layout("rack_trigger", 0x0262, _RACK_TRIGGER, "6H8iH", may_be_longer=True),
     Layout("velocity", 0x0415, _VELOCITY, "H3i"),
     Layout("homed", 0x0444, _CHANNEL),
     Layout("moved", 0x0464, _CHANNEL),

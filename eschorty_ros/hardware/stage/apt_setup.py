@@ -232,15 +232,15 @@ class AptSetup:
             "width_us": _PULSE_US,
             "cycles": 1,
         }
-        kind = "pulses"
+        kind, channel = "pulses", 1
         if self._settings.controller == "bbd30x":
-            kind = "rack_trigger"
             port, bay = self._settings.trigger_port, self._settings.bay
+            kind, channel = "rack_trigger", bay
             wiring = apt.pack("set_rack_port", apt.SINGLE_UNIT, port=port, mode=_OUTPUT, source=bay)
             self._link.send(wiring)
             pulses |= {"in_mode": _OFF, "in_polarity": 1, "in_source": 0}
             pulses |= {"out_mode": mode, "out_polarity": 1}
-        self.send(f"set_{kind}", **pulses)
+        self.send(f"set_{kind}", channel=channel, **pulses)
         self._check_trigger(kind, pulses)
 
     def _switch_trigger(self, mode: int) -> dict[str, int]:

@@ -1,7 +1,7 @@
 """Thorlabs DDS stage behind a KBD101 or a BBD30x: moves that end by themselves, faults with names.
 
 Unconfirmed on hardware: the sense of the direction bits (never used), the homing end, the delay
-between an order and its motion (fitted), and the racks' trigger messages.
+between an order and its motion (fitted), and the length of the racks' trigger message.
 """
 
 from __future__ import annotations

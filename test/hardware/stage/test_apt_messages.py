@@ -127,6 +127,16 @@ def test_fields_are_those_of_the_oracle(id: int, payload: bytes) -> None:
             assert (name in decoded) == bool(getattr(theirs, oracles.get(name, name))), name
 
 
+@pytest.mark.parametrize("reserved_words", [1, 4])
+def test_answers_about_a_racks_trigger_have_either_length(reserved_words: int) -> None:
+    """The manual has four reserved words, a published driver sends one."""
+    values = struct.pack("<6H8i", 2, 0, 1, 0, 0x0D, 1, *PULSES.values())
+    data = frame(0x0262, values + bytes(2 * reserved_words))
+    assert apt.frame_bytes(data[:6]) == len(data)
+    answer = apt.parse(data)
+    assert {name: answer.integer(name) for name in PULSES} == PULSES
+
+
 def test_axis_data_of_the_manual() -> None:
     values = (1, 0, 0, b"MLS203", 94_000_001, 20_000, 0, 1_500_000, 27_488, 27_488, 26_843_546)
     ours, theirs = both(frame(0x04F2, struct.pack("<3H16s2I5i24x", *values)))
