@@ -360,7 +360,7 @@ class Motion:
         frozen = (
             before is not None and abs(status.position_mm - before.position_mm) <= _TOLERANCE_MM
         )
-        rests = frozen and not status.bits & apt.MOVING
+        rests = frozen and not status.bits & (apt.MOVING | apt.INITIALISING)
         arrived = abs(status.position_mm - self.target_mm) <= _TOLERANCE_MM
         homing = self.kind is Kind.HOME
         self._seen_moving |= not rests and before is not None

@@ -135,6 +135,23 @@ def test_moves_are_refused_with_a_reason() -> None:
         bench.stage.home()
 
 
+def test_homing_waits_for_the_search_of_the_phase(bench: AptBench) -> None:
+    """The axis is enabled and rests now and then while the controller takes no order."""
+    bench.model.reboot()
+    bench.model.extra_bits = 0x0800
+    begun_ns = bench.now_ns
+
+    def search() -> None:
+        if bench.now_ns > begun_ns + 4_000_000_000:
+            bench.model.extra_bits = 0
+
+    bench.on_tick = search
+    bench.stage = bench.open()
+    assert bench.now_ns > begun_ns + 4_000_000_000
+    bench.stage.home()
+    bench.until(lambda: bench.stage.state().homed, 30.0)
+
+
 def test_profiled_stop_is_on_the_wire_at_once() -> None:
     """The line is busy with polling at 200 Hz and a queue of requests."""
     bench = AptBench(AptSettings(poll_hz=200.0))
