@@ -184,7 +184,8 @@ SETTLED: Final = 0x2000
 POSITION_ERROR: Final = 0x4000
 COMMAND_ERROR: Final = 0x8000
 ERROR: Final = 0x4000_0000
-FAULTS: Final = 0x4E0E_0000
+# Without over_current: a short one is normal, and a lasting one disables the axis.
+FAULTS: Final = 0x4A0E_0000
 ENABLED: Final = 0x8000_0000
 
 

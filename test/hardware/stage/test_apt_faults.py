@@ -291,6 +291,14 @@ def test_a_refused_command_is_no_fault_of_the_axis(moving: AptBench, any_error: 
     assert moving.stage.statistics()["command_errors"] == 1
 
 
+def test_a_current_peak_is_no_fault(moving: AptBench) -> None:
+    """The controller reports it in fast accelerations; a lasting one disables the axis."""
+    moving.model.extra_bits = 0x0400_0000
+    moving.until(lambda: not moving.stage.state().moving)
+    assert moving.stage.state().position_mm == pytest.approx(200.0, abs=1e-4)
+    assert "over_current" in moving.stage.state().flags
+
+
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("controller rebooted")
 def test_a_restarted_controller_must_be_homed(bench: AptBench, rests: bool) -> None:
