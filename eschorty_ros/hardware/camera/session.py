@@ -155,12 +155,12 @@ class Session:
         return DeviceIdentity("Prophesee EVK4", serial, text)
 
     def _initialise(self) -> None:
-        run_sequence(self.control, imx636.STOP + imx636.DESTROY + imx636.INIT, self._sleep)
         if not imx636.is_imx636(self.control):
             raise DeviceError(
                 f"{NAME} {self.identity.serial}: its sensor does not answer as an IMX636 "
                 f"(register 0014 reads {self.control.read(imx636.CHIP_ID):08X}); power-cycle it"
             )
+        run_sequence(self.control, imx636.STOP + imx636.DESTROY + imx636.INIT, self._sleep)
         monitors.begin_monitors(self.control, self._sleep)
         event_rate.initialise(self.control)
 

@@ -44,6 +44,17 @@ def test_old_firmware_is_refused() -> None:
     assert not model.claims
 
 
+def test_another_sensor_is_refused_and_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    with CameraBench() as bench:
+        written: list[int] = []
+        monkeypatch.setattr(bench.model, "read", lambda _address: 0x30501C01)
+        monkeypatch.setattr(bench.model, "write", lambda address, _value: written.append(address))
+        with pytest.raises(DeviceError, match=r"not answer as an IMX636 .*0014 reads 30501C01"):
+            bench.camera.open()
+        assert not written
+        assert not bench.model.claims
+
+
 def test_slow_link_is_a_warning() -> None:
     with CameraBench() as bench:
         object.__setattr__(bench.model.identity, "speed", 3)
