@@ -222,7 +222,9 @@ def _inside(places: Array) -> NDArray[np.bool_]:
     """
     from scipy.ndimage import binary_closing, binary_erosion
 
-    low, extent = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-9)
+    low, extent = places.min(axis=0), np.ptp(places, axis=0)
+    # A line has as many cells as points, too.
+    extent = np.maximum(extent, max(extent.max() / len(places), 1e-9))
     radius_mm = math.sqrt(_NORMAL_NEIGHBOURS * extent[0] * extent[1] / (math.pi * len(places)))
     # Three cells to the radius, in a margin that neither step reaches.
     cell = np.floor((places - low) / radius_mm * 3.0).astype(np.intp) + 4
