@@ -274,6 +274,10 @@ class InstrumentClient(PacedWaiting):
                 self.tick()
         self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
                   "laser: its output does not read back on")  # fmt: skip
+        self._check_modulation()
+
+    def _check_modulation(self) -> None:
+        """Raise ``ScanFailure`` when the modulation read back is no longer the sequence's."""
         if fault := self._other_modulation():
             raise ScanFailure(f"{fault}; another program has set it: stop that program")
 
@@ -283,6 +287,7 @@ class InstrumentClient(PacedWaiting):
             ("laser/arm", Trigger.Request()),
             ("laser/enable", SetBool.Request(data=True)),
         ):
+            self._check_modulation()
             answer = self._call(name, request)
             if not answer.success:
                 return str(answer.message)

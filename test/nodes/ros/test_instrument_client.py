@@ -141,19 +141,36 @@ def test_a_laser_that_waits_for_a_heartbeat_is_named_in_the_feedback():
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (LaserReport(LaserOutput.ON, 50.0, 0.3, ""), "frequency reads back 50 Hz, requested 70 Hz"),
-        (LaserReport(LaserOutput.ON, 70.0, 0.9, ""), "duty reads back 0.9, requested 0.3"),
+        ((50.0, 0.3), "frequency reads back 50 Hz, requested 70 Hz"),
+        ((70.0, 0.9), "duty reads back 0.9, requested 0.3"),
     ],
 )
-def test_a_modulation_that_another_program_sets_before_the_light_ends_the_sequence(other, words):
-    client = CanceledClient(canceled=False)
+@pytest.mark.parametrize("set_at", ["before", "laser/arm", "laser/enable"])
+def test_a_modulation_that_another_program_sets_ends_the_sequence(other, words, set_at):
+    """Before there is light where it is known by then."""
+    client, calls = CanceledClient(canceled=False), []
     taken = SimpleNamespace(results=[SimpleNamespace(successful=True)] * 2)
     client._clients["laser/set_parameters"] = SimpleNamespace(
         call_async=lambda request: Answered(taken, 1)
     )
-    client.monitor.update_laser(LaserReport(LaserOutput.OFF, 70.0, 0.3, ""), 0.0)
+
+    def report(output, modulation):
+        client.monitor.update_laser(LaserReport(output, *modulation, ""), 0.0)
+
+    def answer(name, output):
+        calls.append(name)
+        report(output, other if name == set_at else (70.0, 0.3))
+        return Answered(SimpleNamespace(success=True), 1)
+
+    for name, output in (("laser/arm", LaserOutput.OFF), ("laser/enable", LaserOutput.ON)):
+        client._clients[name] = SimpleNamespace(
+            call_async=lambda request, name=name, output=output: answer(name, output)
+        )
+    report(LaserOutput.OFF, (70.0, 0.3))
     client.configure_laser(70.0, 0.3)
     client._heartbeat = SimpleNamespace(begin=lambda: None, healthy=True)
-    client._arm_and_enable = lambda: client.monitor.update_laser(other, 0.0)
+    if set_at == "before":
+        report(LaserOutput.OFF, other)
     with pytest.raises(ScanFailure, match=f"^laser: {words}; another program has set it"):
         client.laser_on()
+    assert ("laser/enable" in calls) == (set_at == "laser/enable")
