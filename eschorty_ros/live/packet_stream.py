@@ -249,6 +249,8 @@ class PacketStream:
             self._warnings.end(self.warnings)
             # What is set from here on is for the next light.
             self._lit_rate_hz = self.profile_rate_hz
+            if self._recorder is not None:
+                self._recorder.laser_off()
         self._on_since_ns = on_since_ns
         before, self._reported = self._laser, (modulation, epoch_ns)
         self._follow_laser(before)

@@ -68,9 +68,11 @@ class ScanRecorder:
         # Of the reconstruction's thread.
         self._run: tuple[Reconstructor, SensorEpoch, int] | None = None
         self._lost = self._left_out = self._missing = self._last_ns = self._sent = 0
-        self._laser_on = False
+        # Whether packets may hold light: until it is known that it has ended.
+        self._lit, self._laser_on = True, False
         self._modulation: Modulation | None = None
-        self._stream_ended = ""
+        # Why the stream is not that of the recording any more, and why packets were left out.
+        self._stream_ended = self._cause = ""
         self._stage_ns, self._stage_mm = array("q"), array("d")
         # Of the recorder's thread.
         self._writer: RecordingWriter | None = None
@@ -120,8 +122,12 @@ class ScanRecorder:
             with self._arrived:
                 self._arrived.wait_for(lambda: self._waiting_bytes <= self._queue_bytes)
         if self._stream_ended or self._waiting_bytes > self._queue_bytes:
-            self._left_out += 1
             self._missing += 1
+            if self._lit or not self._stream_ended:
+                self._left_out += 1
+                self._cause = (
+                    self._stream_ended or f"the disk took none for {self._queue_bytes >> 20} MiB"
+                )
             return
         missing, laser_on, data = self._missing, self._laser_on, packet.data
         self._missing, self._laser_on, self._last_ns = 0, False, packet.stamp_ns
@@ -130,7 +136,11 @@ class ScanRecorder:
 
     def laser_on(self) -> None:
         """Note that the phase is estimated again from the next packet on."""
-        self._laser_on = True
+        self._lit = self._laser_on = True
+
+    def laser_off(self) -> None:
+        """Note that the scan needs no packet of another stream from the next one on."""
+        self._lit = False
 
     def stage(self, t_ns: int, position_mm: float) -> None:
         """Queue a stage sample at ROS time ``t_ns``."""
@@ -226,13 +236,12 @@ class ScanRecorder:
     def _write_end(self, samples: NDArray[np.void], points: Points | None, reason: str) -> None:
         writer = self._writer
         left_out = self._left_out + self._unwritten
-        slow = f"the disk took none for {self._queue_bytes >> 20} MiB" if left_out else ""
         self._log = replace(
             self._log,
             state="ended",
             packets_lost=self._lost,
             packets_left_out=left_out,
-            reason=self.failure or self._stream_ended or slow or None,
+            reason=self.failure or self._cause or None,
         )
         lacks = "; ".join(text for text in (self._log.reason, reason) if text) or None
         try:

@@ -13,6 +13,7 @@ import recorded_scan
 from recorded_scan import LiveScan
 from waiting import DEADLINE_S
 
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import ScanLog, load_recording, read_cloud
 from eschorty_ros.core.storage.raw_file import RawReader
@@ -22,6 +23,7 @@ from eschorty_ros.live import scan_recorder
 from eschorty_ros.live.recorded_packets import timed_packets
 from eschorty_ros.live.scan_recorder import ScanRecorder
 
+SQUARE, OTHER = Modulation(70.0), Modulation(50.0)
 FIELDS = ("x", "z", "intensity", "sigma", "column")
 
 
@@ -65,6 +67,19 @@ def test_the_recording_of_a_scan_that_ended_early_has_the_reason_and_its_caller_
     scan.run(reason="canceled")
     assert scan.recorder.wait(10.0) == ""
     assert load_recording(tmp_path / "rec").scan.faults == ["canceled"]
+
+
+def test_packets_after_the_end_of_the_light_are_not_missed(tmp_path, source):
+    """Another modulation ends the recording, which lacks something only where light follows."""
+    off, on = (330_000, SQUARE, False), (360_000, OTHER, True)
+    for name, after in (("dark", ()), ("lit", (on,))):
+        scan = LiveScan(source, tmp_path / name)
+        report = scan.run(later=(off, (340_000, OTHER, False), *after))
+        words = scan.recorder.wait(DEADLINE_S)
+        assert ("packets are not recorded: camera, modulation" in words) == bool(after)
+        assert bool(words) == bool(load_recording(tmp_path / name).scan.faults) == bool(after)
+        if not after:
+            assert_same(again(tmp_path / name).points, report.scan.points)
 
 
 def test_a_killed_process_leaves_the_recording_up_to_then(tmp_path, source):

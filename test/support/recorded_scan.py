@@ -61,13 +61,16 @@ class LiveScan:
                 self.packets.append((decoder.time_us, Packet(seq, stamp_ns, data)))
         self.samples = recording.stage_samples.tolist()
 
-    def run(self, until_us=1 << 60, reason=""):
+    def run(self, until_us=1 << 60, reason="", later=()):
         """Feed what comes before ``until_us``; return the scan's report, or None before its end.
+
+        ``later`` are states of the laser after its start: since when (us), modulation, whether on.
 
         As in the node, up to three packets wait for each other, and what happens between two
         packets takes effect there.
         """
-        pipeline, begun, lit, row, now_s = self.pipeline, False, False, 0, 0.0
+        pipeline, begun, row, now_s = self.pipeline, False, 0, 0.0
+        states = [(LASER_US, self.modulation, True), *later]
         pipeline.stream.set_laser(self.modulation, None)
         for index, (t_us, packet) in enumerate(self.packets):
             if t_us > until_us:
@@ -81,11 +84,11 @@ class LiveScan:
                 begun = True
                 pipeline.process(now_s)
                 pipeline.begin_scan("s", *LIMITS_MM, self.recorder)
-            if not lit and t_us > LASER_US:
-                lit = True
+            while states and t_us > states[0][0]:
+                since_us, modulation, on = states.pop(0)
                 pipeline.process(now_s)
-                on_ns = ZERO_NS + LASER_US * 1000
-                pipeline.stream.set_laser(self.modulation, None, on_ns)
+                on_ns = ZERO_NS + since_us * 1000 if on else None
+                pipeline.stream.set_laser(modulation, None, on_ns)
             pipeline.add_packet(packet, now_s)
             if index % 3 == 2:
                 pipeline.complete(now_s)
