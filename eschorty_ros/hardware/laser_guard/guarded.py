@@ -38,7 +38,14 @@ HEARTBEATS_PER_TIMEOUT = 5
 OPEN_TIMEOUT_S = 20.0
 DISABLE_TIMEOUT_S = 2.0
 EXIT_TIMEOUT_S = 2.0
-_DIRECT_TIMEOUT_S = 1.0
+_RETRIES_END_S = 1.0
+_DIRECT_TIMEOUT_S = 3.0
+"""For the retries and the last one's disabling, 2 s; a generator that hangs may take any time."""
+_UNKNOWN = "laser state unknown: its guard is gone"
+_HANGS = (
+    f"{_UNKNOWN} and the generator does not answer; treat the laser as on and switch the generator "
+    "off by hand"
+)
 _TURN_S = 0.02
 _LATE_S = 0.1
 
@@ -77,6 +84,7 @@ class GuardedLaser:
         self._dark = True
         self._lost = ""
         self._direct = threading.Lock()
+        self._direct_ends_s = 0.0
         self._off_confirmed = False
         self._guard = ServedGuard(guard) if guard else OwnGuard()
         self._wire = Wire(self._guard.end)
@@ -124,22 +132,31 @@ class GuardedLaser:
     def disable(self) -> None:
         """Switch the output off and disarm; idempotent.
 
-        Raises ``DeviceError`` when it is not confirmed that the output is off.
+        Raises ``DeviceError`` when it is not confirmed that the output is off, after 5 s at most.
         """
         if not self._lost:
             try:
                 self._call("disable", DISABLE_TIMEOUT_S)
             except DeviceTimeoutError:
-                self._guard.kill()
+                self._lose_guard()
             except DeviceGoneError:
                 if not self._lost:
                     raise
             else:
                 self._dark = True
                 return
-        # The watching thread does it now, or has tried.
-        self._thread.join(EXIT_TIMEOUT_S)
-        self._disable_directly()
+        with self._direct:
+            # The watching thread does it now, or has tried.
+            if not (self._thread.is_alive() or self._off_confirmed):
+                self._lose_guard()
+                self._thread = threading.Thread(
+                    target=self._replace_guard, name="laser off", daemon=True
+                )
+                self._thread.start()
+        # One that hangs is waited for once.
+        self._thread.join(max(self._direct_ends_s - time.monotonic(), 0.0))
+        if not self._off_confirmed:
+            raise DeviceError(self._lost)
 
     def readback(self) -> LaserReadback:
         """Read settings and output state back."""
@@ -199,7 +216,7 @@ class GuardedLaser:
         """Wait for the end or the stop of the guard's process, and replace it then."""
         raise_priority(GUARD_NICE)
         self._guard.wait_until_lost()
-        self._guard.kill()
+        self._lose_guard()
         if not self._dismissed:
             self._replace_guard()
 
@@ -229,9 +246,13 @@ class GuardedLaser:
                 # Also while it dumps core, before its end.
                 self._guard.kill()
 
+    def _lose_guard(self) -> None:
+        self._direct_ends_s = time.monotonic() + _DIRECT_TIMEOUT_S
+        self._lost = self._lost or _HANGS
+        self._guard.kill()
+
     def _replace_guard(self) -> None:
         """Disable the output in place of the guard, then answer every call that waits for it."""
-        self._lost = "laser state unknown: its guard is gone"
         ended = self._guard.ending(EXIT_TIMEOUT_S)
         if self._opened:
             try:
@@ -246,20 +267,15 @@ class GuardedLaser:
 
     def _disable_directly(self) -> None:
         """Open the generator, which the dead guard has released, and close it: it is off then."""
-        with self._direct:
-            if self._off_confirmed:
-                return
-            end_s = time.monotonic() + _DIRECT_TIMEOUT_S
-            while not self._off_confirmed:
-                try:
-                    open_again(self._open_directly, self.identity.serial).close()
-                    self._off_confirmed = True
-                except EschortyError as error:
-                    if time.monotonic() > end_s:
-                        raise DeviceError(
-                            f"laser state unknown: its guard is gone; {error}"
-                        ) from error
-                    time.sleep(_TURN_S)
+        end_s = time.monotonic() + _RETRIES_END_S
+        while not self._off_confirmed:
+            try:
+                open_again(self._open_directly, self.identity.serial).close()
+                self._off_confirmed = True
+            except EschortyError as error:
+                if time.monotonic() > end_s:
+                    raise DeviceError(f"{_UNKNOWN}; {error}") from error
+                time.sleep(_TURN_S)
 
 
 def _received(answers: queue.SimpleQueue[Message], timeout_s: float) -> Message:

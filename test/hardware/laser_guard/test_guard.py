@@ -427,6 +427,28 @@ def test_closing_when_the_guard_has_just_died_switches_off(awg: AwgProcess, numb
         assert not awg.lit()
 
 
+@pytest.mark.fault("no answer, time-out")
+def test_a_generator_that_hangs_does_not_keep_the_process_from_its_end(
+    awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """driver: waits 5 s at most; user reads: laser state unknown ... switch it off by hand"""
+    answers = threading.Event()
+    with ThreadPoolExecutor() as pool, opened(awg) as laser:
+        light(laser)
+        real = laser._open_directly
+        monkeypatch.setattr(
+            laser, "_open_directly", lambda: real() if answers.wait(3.0 * DEADLINE_S) else None
+        )
+        os.kill(laser.guard_pid, signal.SIGSTOP)
+        try:
+            for call in (laser.disable, laser.close):
+                failure = pool.submit(call).exception(DEADLINE_S)
+                assert "does not answer; treat the laser as on and switch" in str(failure)
+        finally:
+            answers.set()
+        wait_until(lambda: not awg.lit(), "the output off once it answers")
+
+
 def test_stall_of_the_guard_is_no_missing_heartbeat(
     awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
