@@ -153,6 +153,7 @@ def test_killed_reconstruction_ends_the_scan_at_once(instrument, tmp_path):
     assert dark_s <= 0.25
     process.kill()
     running["reconstruction"] = started(RECONSTRUCTION, instrument)
+    scenarios.full_scan(bench)
 
 
 def test_killed_scanner_leaves_the_points_so_far(instrument):
