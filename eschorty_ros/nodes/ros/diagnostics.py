@@ -17,6 +17,8 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 
+NO_CLOCK = "use_sim_time is true and nothing is on /clock; leave it out with real devices"
+
 Report = tuple[bytes, str, Mapping[str, Any]]
 
 
@@ -67,6 +69,9 @@ class Diagnostics:
                 f"; {fresh} messages were refused in the last second, the last of {refused.last}"
             )
         self._refused = total
+        now = self._node.get_clock().now()
+        if not now.nanoseconds and NO_CLOCK not in message:
+            level, message = max(level, WARN), f"{message}; {NO_CLOCK}"
         values = {**values, **refused.values()}
         waiting = getattr(self._node, "waiting", "")
         if waiting:
@@ -79,7 +84,7 @@ class Diagnostics:
             values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        array.header.stamp = now.to_msg()
         self._publisher.publish(array)
 
 

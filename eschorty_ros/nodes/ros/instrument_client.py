@@ -44,6 +44,7 @@ from eschorty_ros.msg import LaserState, ReconstructionState, StageLimits
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stage_position_mm
+from eschorty_ros.nodes.ros.diagnostics import NO_CLOCK
 from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.peers import OnePublisher, age_s
@@ -61,7 +62,6 @@ _STARTING = (
     "its node is there; a first start compiles kernels, for some minutes: wait, or run "
     "`eschorty compile` before"
 )
-_NO_CLOCK = "use_sim_time is true and nothing is on /clock; leave it out with real devices"
 # Longer than until the reconstruction gives up, with the longest stage_timeout.
 _ASSEMBLE_S = 100.0
 # The reconstruction first works off the packets that a broken link has held back.
@@ -180,7 +180,7 @@ class InstrumentClient(PacedWaiting):
         )
         states = self._states.items()
         return [
-            (lambda: self._now_ns() > 0, f"{self._node.get_name()}: {_NO_CLOCK}"),
+            (lambda: self._now_ns() > 0, f"{self._node.get_name()}: {NO_CLOCK}"),
             *((ready, partial(self._absent, name)) for name, ready in servers),
             *((state.active, f"{name}: {_NOT_ACTIVE}") for name, state in states),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
