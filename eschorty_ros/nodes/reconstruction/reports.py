@@ -105,7 +105,7 @@ class Reports:
             if late:
                 topic = self._node.resolve_topic_name("camera/events")
                 self._node.get_logger().warning(
-                    f"no packets on {topic} yet; check the camera's node and the topic",
+                    f"no packets on {topic} yet; check the camera's node, the topic and its QoS",
                     throttle_duration_sec=_REMINDER_S,
                 )
             return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values
