@@ -6,6 +6,7 @@ there are a hundred of them. Boxed arrays are taken apart once.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
@@ -25,11 +26,10 @@ class Boxed(structref.StructRefProxy):
 
     def __new__(cls, content: Any) -> Boxed:
         """Return ``content`` boxed."""
-        try:
-            boxed: Boxed = _box()(content)
-        except SystemError as error:
-            # numba makes an object by Python's code, and does not see that this is interrupted.
-            raise error.__cause__ or error from None
+        # numba makes an object by Python's code, and does not see that a signal interrupts this.
+        # Signals interrupt the main thread alone.
+        with ThreadPoolExecutor(1) as thread:
+            boxed: Boxed = thread.submit(_box(), content).result()
         return boxed
 
 

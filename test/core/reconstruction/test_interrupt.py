@@ -61,6 +61,46 @@ def test_an_interrupt_at_any_moment_is_an_exception(jobs):
     assert int(done.stdout) > 30
 
 
+BOXING = """
+import random, signal, time
+
+import numpy as np
+
+from eschorty_ros.core.base.boxed import Boxed
+
+content = tuple(np.zeros(3) for _ in range(100))
+
+
+def boxed():
+    for _ in range(100):
+        Boxed(content)
+
+
+boxed()
+begun_s = time.perf_counter()
+boxed()
+duration_s = time.perf_counter() - begun_s
+random.seed(3)
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+caught = 0
+for _ in range(60):
+    try:
+        signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-4, duration_s))
+        boxed()
+        time.sleep(duration_s)
+    except KeyboardInterrupt:
+        caught += 1
+print(caught)
+"""
+
+
+def test_an_interrupt_while_arrays_are_boxed_is_an_exception():
+    print("seed 3")
+    done = subprocess.run([sys.executable, "-c", BOXING], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 45
+
+
 @pytest.fixture(scope="module")
 def data():
     def flat(k, c):
