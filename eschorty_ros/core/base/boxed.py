@@ -6,7 +6,7 @@ there are a hundred of them. Boxed arrays are taken apart once.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from _thread import allocate_lock, start_new_thread
 from functools import cache
 from typing import Any
 
@@ -27,9 +27,23 @@ class Boxed(structref.StructRefProxy):
     def __new__(cls, content: Any) -> Boxed:
         """Return ``content`` boxed."""
         # numba makes an object by Python's code, and does not see that a signal interrupts this.
-        # Signals interrupt the main thread alone.
-        with ThreadPoolExecutor(1) as thread:
-            boxed: Boxed = thread.submit(_box(), content).result()
+        # Signals interrupt the main thread alone, and a bare lock as the one wait without a fault.
+        results: list[Boxed | BaseException] = []
+        done = allocate_lock()
+        done.acquire()
+
+        def box() -> None:
+            try:
+                results.append(_box()(content))
+            except BaseException as error:
+                results.append(error)
+            done.release()
+
+        start_new_thread(box, ())
+        done.acquire()
+        boxed = results[0]
+        if isinstance(boxed, BaseException):
+            raise boxed
         return boxed
 
 
