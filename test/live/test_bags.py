@@ -74,7 +74,7 @@ def test_a_conversion_that_is_killed_leaves_a_recording_that_was_not_ended(
         if bag_files.ODOMETRY in kinds:
             while not (folder / "scan.yaml").exists():
                 sleep(0.01)
-            shutil.copytree(folder, killed)
+            shutil.copytree(folder, killed, ignore=shutil.ignore_patterns(".*-partial"))
 
     monkeypatch.setattr(bag_files.BagReader, "messages", copied_after_the_last)
     bag_to_recording(bag, folder)
