@@ -447,6 +447,12 @@ def test_a_generator_that_hangs_does_not_keep_the_process_from_its_end(
         finally:
             answers.set()
         wait_until(lambda: not awg.lit(), "the output off once it answers")
+        wait_until(
+            lambda: (
+                not {"laser guard", "laser off"} & {each.name for each in threading.enumerate()}
+            ),
+            "the generator released",
+        )
 
 
 def test_stall_of_the_guard_is_no_missing_heartbeat(
