@@ -1,7 +1,7 @@
 """The address of a compiled function, as an argument of others.
 
-numba compiles a kernel again into each kernel that calls it; one that is called by its address is
-compiled once.
+A kernel becomes machine code in each entry kernel that uses it; one that is called by its address
+becomes so once.
 """
 
 from __future__ import annotations
