@@ -76,13 +76,26 @@ class Stage(Client):
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
+def started() -> Iterator[Stage]:
     with (
         bench_here() as (emulated, folder),
         Observer() as observer,
         contextlib.ExitStack() as stack,
     ):
         yield Stage(stack, observer, emulated, folder)
+
+
+@pytest.fixture
+def stage(started: Stage) -> Stage:
+    """The active node; one that a stall of this computer has failed is configured again."""
+    assert started.process.running()
+    observer = started.observer
+    if observer.lifecycle_state("stage") != "active":
+        assert "stage lost: the stage controller sent no status" in started.process.output
+        observer.wait_for_state("stage", "unconfigured")
+        assert observer.change_state("stage", "configure")
+        assert observer.change_state("stage", "activate")
+    return started
 
 
 def test_activate_homes(stage: Stage) -> None:
