@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.estimators import _mean
 from eschorty_ros.core.line.footprint_symmetry import _PLACES, _centre, _is_asymmetric
-from eschorty_ros.core.line.line_history import _moves_fast
+from eschorty_ros.core.line.line_history import _mean_of_blocks
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
@@ -55,6 +55,9 @@ _OFF_LINE_PX = 1.0
 # Learned rows take twice the time of means. They pay where they scatter less than means of twice
 # the events would.
 _PAYS = np.sqrt(0.5)
+# Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
+# than what its rows scatter.
+_FAST_PX = 0.5
 # Profiles that show it: the median of a profile's differences is known to some percent.
 _TRIALS = 2
 # Shares of the posterior by the logarithm below the best; less counts as none.
@@ -400,7 +403,8 @@ def _choose(footprint, row, history, is_last, always):
             state.trials += 1
         footprint.trial[:] = 0.0
     if is_last or state.trials == _TRIALS or (always and state.trying > 0):
-        least = (1.0 if _moves_fast(history) else _PAYS) * state.scatter
+        fast = _mean_of_blocks(history.step_px > _FAST_PX, history.now.points) > 0.5
+        least = (1.0 if fast else _PAYS) * state.scatter
         pays = always or state.scatter_learned < least
         state.choice = LEARNED_ROWS if pays else MEAN_ROWS
         state.trying = 0

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.line_history import _mean_of_blocks
 from eschorty_ros.core.line.pixel_locking import (
     _clear_levels,
     _locking_variance,
@@ -192,20 +193,6 @@ def _columns_averaged(smoothing):
     return total / points if points > 0 else 1.0
 
 
-@kernel(_nrt=False)
-def _displacement_px(history):
-    """Return how far lines move from profile to profile, the mean of the blocks with points.
-
-    It is no more than they have moved in the last one.
-    """
-    total, blocks = 0.0, 0
-    for block in range(1, history.step_px.size - 1):
-        if history.now.points[block] > 0.0:
-            total += min(history.step_px[block], abs(history.recent.difference[block]))
-            blocks += 1
-    return total / max(blocks, 1)
-
-
 @kernel
 def _locking2(columns, row, half, gate, levels):
     """Return the variance that all rows of the events in a gate share as pixels are whole."""
@@ -237,7 +224,9 @@ def _learn_gate(columns, half, smoothing, history, levels, gate):
     """
     state = gate.state
     changed, state.changed = state.changed > 0, 0
-    moving = np.int64(_displacement_px(history) * FRACTION)
+    # No more than the lines have moved in the last profile.
+    step_px = np.minimum(history.step_px, np.abs(history.recent.difference))
+    moving = np.int64(_mean_of_blocks(step_px, history.now.points) * FRACTION)
     if state.known > 0:
         uses_gate = state.on_span != gate.choices[0].on_span
         faster = uses_gate and moving > max(2 * state.moving, _STILL)

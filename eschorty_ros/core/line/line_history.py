@@ -36,9 +36,6 @@ _JITTER_MAX_PX = 1.0
 _JITTER_PER_BACK = 1.5
 # Profiles whose mean a profile is compared with.
 RECENT_PROFILES = 16.0
-# Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
-# than what its rows scatter.
-_FAST_PX = 0.5
 # A width or row is the same while it changes by this many deviations at most, and steady when it
 # has been so for more than two profiles.
 STEADY = 2.0 * np.sqrt(2.0)
@@ -347,22 +344,11 @@ def _compare_with_recent(history, known, usual, width_variance):
 
 
 @kernel(_nrt=False)
-def _moves_fast(history):
-    """Return whether most blocks with points move by more than half a row per profile."""
-    blocks, fast = 0, 0
-    for block in range(1, history.step_px.size - 1):
-        if history.now.points[block] > 0.0:
-            blocks += 1
-            fast += history.step_px[block] > _FAST_PX
-    return 2 * fast > blocks
-
-
-@kernel(_nrt=False)
-def _mean_step_px(history):
-    """Return by how much the line moves from profile to profile, the mean of blocks with points."""
+def _mean_of_blocks(values, points):
+    """Return the mean of ``values`` over the blocks that have ``points``."""
     blocks, total = 0, 0.0
-    for block in range(1, history.step_px.size - 1):
-        if history.now.points[block] > 0.0:
+    for block in range(1, points.size - 1):
+        if points[block] > 0.0:
             blocks += 1
-            total += history.step_px[block]
+            total += values[block]
     return total / max(blocks, 1)

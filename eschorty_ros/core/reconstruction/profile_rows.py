@@ -56,7 +56,7 @@ from eschorty_ros.core.line.line_history import (
     RECENT_PROFILES,
     LineHistory,
     _compare_polarities,
-    _mean_step_px,
+    _mean_of_blocks,
     _restart_history,
     empty_history,
 )
@@ -441,15 +441,10 @@ def _learn_line(memory, half, learns, is_last):
         _restart_from(memory.known, footprint)
     if learns:
         computations, asymmetric = footprint.state.computations, footprint.state.asymmetric
-        lit_displacement_px = memory.light.lit_share * _mean_step_px(history)
-        _learn(
-            footprint,
-            rows,
-            memory.smoothing.row[0],
-            estimator.sensor_rows,
-            lit_displacement_px,
-            half,
-        )
+        step_px = _mean_of_blocks(history.step_px, history.now.points)
+        displacement_px = memory.light.lit_share * step_px
+        row, sensor_rows = memory.smoothing.row[0], estimator.sensor_rows
+        _learn(footprint, rows, row, sensor_rows, displacement_px, half)
         counters.footprints += footprint.state.computations - computations
         counters.footprints_asymmetric += footprint.state.asymmetric - asymmetric
     if state.known_half == 0:
