@@ -354,6 +354,18 @@ def _drop_x(c, row, limit):
     c.events_without_y += 1
 
 
+@kernel(inline="always")
+def _columns_of(row, width, height):
+    """Return the number of columns of a row: 0 outside the sensor."""
+    return width if np.uint64(row) < np.uint64(height) else 0
+
+
+@kernel(inline="always")
+def _store(s, t, row, base, polarity, columns):
+    """Store what the loop of ``_decode`` keeps in variables."""
+    s.t_us, s.row, s.base, s.polarity, s.limit = t, row, base, polarity, columns
+
+
 def _decode(words, i, until_us, through, memory, sink):
     """Decode ``words`` from ``i`` on; return the next index, the numbers of events and triggers.
 
@@ -382,7 +394,7 @@ def _decode(words, i, until_us, through, memory, sink):
     polarity = np.uint8(s.polarity)
     # Late events take the way of those outside the sensor, so that others need no comparison.
     shown = 0 if s.late else width
-    limit = shown if np.uint64(row) < np.uint64(height) else 0
+    limit = _columns_of(row, shown, height)
     while i < end:
         word = np.uint32(words[i])
         kind = word >> np.uint32(12)
@@ -404,7 +416,7 @@ def _decode(words, i, until_us, through, memory, sink):
             if x < limit:
                 n = _emit(sink, n, t, x, row, (word >> np.uint32(11)) & np.uint32(1))
             else:
-                limit_x = width if np.uint64(row) < np.uint64(height) else 0
+                limit_x = _columns_of(row, width, height)
                 if x < limit_x:
                     i -= one
                     break
@@ -428,8 +440,7 @@ def _decode(words, i, until_us, through, memory, sink):
                     n = _emit(sink, n, t, first + np.int64(ctz64(mask)), row, polarity)
                     mask &= mask - one
             else:
-                s.t_us, s.row, s.base, s.polarity = t, row, base, polarity
-                s.limit = width if np.uint64(row) < np.uint64(height) else 0
+                _store(s, t, row, base, polarity, _columns_of(row, width, height))
                 i, n = _triple_by_words(words, i - one, s, c, sink, n)
                 base = s.base
                 if s.late == _STOPPED:
@@ -450,7 +461,7 @@ def _decode(words, i, until_us, through, memory, sink):
                 t = floor
             s.late = _LATE if t >= until_us else _IN_TIME
             shown = 0 if s.late else width
-            limit = shown if np.uint64(row) < np.uint64(height) else 0
+            limit = _columns_of(row, shown, height)
         elif kind == w3.TIME_HIGH:
             if n + m != mark:
                 mark = n + m
@@ -458,7 +469,7 @@ def _decode(words, i, until_us, through, memory, sink):
             t = _time_high(s, c, np.int64(word & np.uint32(0xFFF)), floor)
             s.late = _LATE if t >= until_us else _IN_TIME
             shown = 0 if s.late else width
-            limit = shown if np.uint64(row) < np.uint64(height) else 0
+            limit = _columns_of(row, shown, height)
         elif kind == w3.EXT_TRIGGER:
             if not through:
                 i -= one
@@ -467,8 +478,7 @@ def _decode(words, i, until_us, through, memory, sink):
             m += one
         elif kind == w3.VECT_8:
             # It belongs to a triple whose first words are missing.
-            s.t_us, s.row, s.base, s.polarity = t, row, base, polarity
-            s.limit = width if np.uint64(row) < np.uint64(height) else 0
+            _store(s, t, row, base, polarity, _columns_of(row, width, height))
             mask = np.uint64(word) & np.uint64(0xFF)
             if _is_late(mask, 8, s):
                 i -= one
@@ -487,12 +497,8 @@ def _decode(words, i, until_us, through, memory, sink):
             c.broken_continuations += 1
         else:
             c.unknown_words += 1
-    s.t_us = t
+    _store(s, t, row, base, polarity, _columns_of(row, width, height))
     s.floor_us = t if n + m != mark else floor
-    s.row = row
-    s.limit = width if np.uint64(row) < np.uint64(height) else 0
-    s.base = base
-    s.polarity = polarity
     s.late = _IN_TIME
     c.events += n
     c.triggers += m
