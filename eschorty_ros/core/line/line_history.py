@@ -112,19 +112,15 @@ class LineHistory(NamedTuple):
     shift_px: NDArray[np.float64]
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
-    windowed: bool
 
 
-def empty_history(columns: int, windowed: bool) -> LineHistory:
-    """Return the history of a line before its first profile.
-
-    That of full columns, not ``windowed``, is not followed: their widths are those of background.
-    """
+def empty_history(columns: int) -> LineHistory:
+    """Return the history of a line before its first profile."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((6, blocks))), BlockMeans(*np.zeros((12, blocks)))
     polarities = PolarityMeans(*np.zeros((3, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
-    return LineHistory(now, recent, polarities, step_px, shift_px, moved2, passing2, windowed)
+    return LineHistory(now, recent, polarities, step_px, shift_px, moved2, passing2)
 
 
 @kernel
@@ -319,7 +315,7 @@ def _compare_with_recent(history, known, usual, width_variance):
     for block in range(1, now.points.size - 1):
         points = _near_sum(now.points, block)
         history.moved2[block], history.passing2[block], history.step_px[block] = 0.0, 0.0, 0.0
-        if points == 0.0 or not history.windowed:
+        if points == 0.0:
             continue
         row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points
         own2, width2 = _near_sum(now.sigma2, block) / (points * points), width_variance / points

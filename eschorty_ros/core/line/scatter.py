@@ -61,8 +61,7 @@ class Differences(NamedTuple):
 class Scatter(NamedTuple):
     """Differences of rows, and ``close`` ones, and ``near`` and ``far`` ones of smoothed rows.
 
-    No difference shows what the ``levels`` do. Only the variances of ``windowed`` means are scaled:
-    those over full columns are as expected.
+    No difference shows what the ``levels`` do.
     """
 
     own: Differences
@@ -70,16 +69,15 @@ class Scatter(NamedTuple):
     near: Differences
     far: Differences
     levels: Levels
-    windowed: bool
 
 
-def empty_scatter(columns: int, windowed: bool) -> Scatter:
+def empty_scatter(columns: int) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     own, close, near, far = (
         Differences(*sums) for sums in np.zeros((4, len(Differences._fields), blocks))
     )
-    return Scatter(own, close, near, far, empty_levels(blocks), windowed)
+    return Scatter(own, close, near, far, empty_levels(blocks))
 
 
 @kernel
@@ -200,8 +198,6 @@ def _without_shape(close, wide):
 @kernel(_nrt=False)
 def _own_ratio(scatter, block):
     """Return the ratio of rows near a block; -1 where it is not known."""
-    if not scatter.windowed:
-        return 1.0
     close = _ratio(scatter.close, block, _DIFFERENCES_MIN)
     wide = _ratio(scatter.own, block, _DIFFERENCES_MIN)
     if min(close, wide) < 0.0:
@@ -214,19 +210,22 @@ def _smoothed_ratio(scatter, block):
     """Return the ratio of smoothed rows near a block; -1 where it is not known."""
     near = _ratio(scatter.near, block, _SMOOTHED_MIN)
     far = _ratio(scatter.far, block, _SMOOTHED_MIN)
-    if min(near, far) < 0.0 or not scatter.windowed:
+    if min(near, far) < 0.0:
         return -1.0
     return _without_shape(near, far)
 
 
 @kernel(_nrt=False)
-def _scale(rows, scatter, smoothing):
-    """Scale the variances of a profile by the scatter, and widen the smoothing gates by it."""
+def _scale(rows, scatter, smoothing, windowed):
+    """Scale the variances of a profile by the scatter, and widen the smoothing gates by it.
+
+    Those of rows that are not ``windowed``, over full columns, are as expected.
+    """
     returns, columns = rows.row.shape
     _add_differences(rows.row[0], rows.sigma2[0], _CLOSE, scatter.close)
     _add_differences(rows.row[0], rows.sigma2[0], APART, scatter.own)
     for block in range(1, scatter.own.number.size - 1):
-        ratio = _own_ratio(scatter, block)
+        ratio = _own_ratio(scatter, block) if windowed else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         # Independent events scatter more than those of pixels, and bound what is not measured.
         independent = 1.0 if ratio < 0.0 else 0.0
@@ -267,8 +266,8 @@ def _share_at(row, locking2):
 
 
 @kernel(_nrt=False)
-def _scale_smoothed(rows, scatter, smoothing):
-    """Scale the smoothed variances of a profile by the scatter left.
+def _scale_smoothed(rows, scatter, smoothing, windowed):
+    """Scale the smoothed variances of a profile by the scatter left, as `_scale` does.
 
     They are no less than what all columns may share, which is in the scatter where the rows differ.
     """
@@ -278,7 +277,7 @@ def _scale_smoothed(rows, scatter, smoothing):
     _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _NEAR_APART, near)
     _add_smoothed_differences(row, sigma2[0], used, rows.sigma2[0], _FAR_APART, far)
     for block in range(1, near.number.size - 1):
-        ratio = _smoothed_ratio(scatter, block)
+        ratio = _smoothed_ratio(scatter, block) if windowed else -1.0
         factor = ratio if ratio >= 0.0 else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         for k in range(returns):

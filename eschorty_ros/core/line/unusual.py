@@ -298,10 +298,11 @@ def _without_motion(smoothed, row, last_row, usual, lit_share, static_width):
 
 
 @kernel(_nrt=False)
-def _follow_line(rows, smoothing, widths, history, lit_share):
+def _follow_line(rows, smoothing, widths, history, lit_share, windowed):
     """Take motion off the widths of a profile's points, and compare it with recent profiles.
 
-    Weak points show no width.
+    Weak points show no width. Rows that are not ``windowed``, over full columns, are not compared:
+    their widths are those of background.
     """
     row, static_width, typical = smoothing.row, widths.static_width, widths.usual.typical
     now = history.now
@@ -330,8 +331,9 @@ def _follow_line(rows, smoothing, widths, history, lit_share):
         now.row[block], now.width[block] = total, width
         now.sigma2[block], now.points[block] = sigma2, points
         now.moved[block], now.in_both[block] = moved, in_both
-    sigma = _SIGMA_PER_MEDIAN * typical.difference
-    _compare_with_recent(history, known, typical.median, WIDTH_COLUMNS * sigma * sigma)
+    if windowed:
+        sigma = _SIGMA_PER_MEDIAN * typical.difference
+        _compare_with_recent(history, known, typical.median, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel
@@ -438,10 +440,10 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, widths, history, few, lit_share):
+def _mark_unusual(rows, smoothing, widths, history, few, lit_share, windowed):
     """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
     row, sigma2, smoothed = smoothing.row, smoothing.sigma2, smoothing.width
-    _follow_line(rows, smoothing, widths, history, lit_share)
+    _follow_line(rows, smoothing, widths, history, lit_share, windowed)
     returns, columns = row.shape
     last, last_row = widths.last, widths.last_row
     known = _is_known(widths)

@@ -28,10 +28,10 @@ from eschorty_ros.core.line.columns import Columns, empty_columns
 from eschorty_ros.core.line.delay import Light, _delay_us
 from eschorty_ros.core.line.estimators import (
     _LEARNED,
-    FULL_COLUMN_METHODS,
     HALF_MIN,
     HALF_PER_SIGMA,
     Estimator,
+    _is_windowed,
     check_method,
     half_width_fixed,
 )
@@ -215,7 +215,6 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
     )
     returns = 2 if settings.returns == "all" else 1
     shape = returns, model.columns
-    windowed = settings.centroid not in FULL_COLUMN_METHODS
     size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
     return Memory(
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
@@ -225,7 +224,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
         known_widths=empty_usual_widths(model.columns),
-        scatter=empty_scatter(model.columns, windowed),
+        scatter=empty_scatter(model.columns),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
             settings.smoothing_gate_px,
@@ -235,7 +234,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         ),
         widths=empty_widths(shape),
         two_lines=empty_two_lines(),
-        history=empty_history(model.columns, windowed),
+        history=empty_history(model.columns),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
         delay=record("time_us", "points"),
@@ -300,7 +299,7 @@ def _is_examined(memory, profiles):
     """
     state = memory.state
     known = state.known_half > 0 and state.profiles % RECENT_PROFILES >= profiles
-    return memory.history.windowed and not known
+    return _is_windowed(memory.estimator.method) and not known
 
 
 @kernel(_nrt=True)
@@ -419,7 +418,7 @@ def _follow(memory, half, restarted):
     _add_lines(columns, half, place, blink)
     _compare_polarities(columns, half, place, history)
     # Before a width is usual, an edge that passes is not seen.
-    if history.windowed and _is_known(memory.widths):
+    if _is_windowed(memory.estimator.method) and _is_known(memory.widths):
         common2 = memory.rows.common2[0]
         _compare_bursts(columns, half, state.profiles, blink, common2, memory.bursts, history)
     state.profiles += 1
@@ -479,13 +478,15 @@ def _close(memory):
     if _is_examined(memory, 1):
         place = (5 * state.profiles) % (BLOCK_COLUMNS - 2)
         _measure_levels(memory.columns, rows.row[0], half, memory.gate.state, place, scatter.levels)
-    _scale(rows, scatter, smoothing)
+    windowed = _is_windowed(estimator.method)
+    _scale(rows, scatter, smoothing, windowed)
     _smooth(rows, smoothing)
-    _scale_smoothed(rows, scatter, smoothing)
+    _scale_smoothed(rows, scatter, smoothing, windowed)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     memory.columns.counts[:] = 0
     few = _few_events(rows, smoothing.isolation_events, state)
-    _mark_unusual(rows, smoothing, memory.widths, memory.history, few, memory.light.lit_share)
+    lit_share = memory.light.lit_share
+    _mark_unusual(rows, smoothing, memory.widths, memory.history, few, lit_share, windowed)
     if single > 0:
         _use_single_line(memory, single)
     followed = _points_followed(memory.history)
