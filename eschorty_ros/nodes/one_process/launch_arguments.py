@@ -16,6 +16,8 @@ from eschorty_ros.core.base.files import config_path
 from eschorty_ros.core.calibration import METHODS, read_distances
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import load_recording
+from eschorty_ros.emulation.bench.devices import BenchSettings
+from eschorty_ros.emulation.bench.physics import TRIGGERS
 from eschorty_ros.nodes.one_process.composition import NAMESPACE, Tables
 from eschorty_ros.nodes.one_process.hardware_file import TABLES, read_parameters
 from eschorty_ros.nodes.reconstruction.auto_calibration import find_distances
@@ -25,9 +27,11 @@ from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.stage.parameters import stage_limits
 from eschorty_ros.simulation.pixels import PRESETS
 from eschorty_ros.simulation.scenes import NAMES, named
+from eschorty_ros.simulation.world import Effects
 
 EVENTS = f"{NAMESPACE}/camera/events"
 BOOLEAN = ("true", "false")
+_BENCH = BenchSettings()
 
 
 def shared_file(name: str) -> Path:
@@ -39,11 +43,11 @@ _DEVICES = (
     Param("fake", "true", "true: real drivers at an emulated bench; false: at real devices",
           choices=BOOLEAN),
     Param("camera", "true", "false: another driver publishes camera/events", choices=BOOLEAN),
-    Param("trigger", "stage",
-          "what is wired to the camera's trigger input: none, laser or stage",
-          choices=("none", "laser", "stage")),
-    Param("pixels", "paper", "event pixels of an emulated camera", choices=tuple(PRESETS)),
-    Param("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
+    Param("trigger", _BENCH.trigger,
+          "what is wired to the camera's trigger input: none, laser or stage", choices=TRIGGERS),
+    Param("pixels", _BENCH.pixels, "event pixels of an emulated camera", choices=tuple(PRESETS)),
+    Param("effects", _BENCH.effects,
+          "effects of an emulated world, such as ambient=0.5,occlusion=1"),
     Param(
         "frequency",
         "70.0",
@@ -61,7 +65,7 @@ _RVIZ = Param("rviz", "false", "true: show cloud, live profile and frames in RVi
 SCAN = (
     *_DEVICES,
     _FILE,
-    Param("scene", "steps", f"what stands on an emulated bench: {', '.join(NAMES)} or a mesh"),
+    Param("scene", _BENCH.scene, f"what stands on an emulated bench: {', '.join(NAMES)} or a mesh"),
     Param("calibration", "config_3", "optical build: a name in config/ or the path of a file"),
     Param("speed", "0.05", "stage speed, m/s"),
     Param("start", "0.01", "stage position where the sweep begins, m"),
@@ -250,9 +254,6 @@ def _check_build(given: Mapping[str, str], values: Tables, built: str) -> None:
     with _naming("calibration"):
         load_calibration(values["reconstruction"]["calibration"])
     if given["fake"] == "true":
-        # Here, as it loads the pixels' kernels.
-        from eschorty_ros.simulation.world import Effects
-
         with _naming("scene"):
             named(given["scene"])
         with _naming("effects"):
