@@ -26,6 +26,7 @@ _LOSSES = {
     "columns_ambiguous": "columns have two equally strong lines; set returns to all",
     "points_beyond_pole": "points are beyond the last range of the calibration; check it",
     "points_outside_roi": "points are outside range_min and range_max; widen them",
+    "points_flagged": "points have a flag; set keep to all",
     "points_outside_scan": "points are outside start to stop of the recorded scan; check the "
     "stage's positions",
 }
@@ -221,7 +222,8 @@ def cause_of_few(
     outside = 2 * max(counters["events_gated"], counters["events_outside_roi"])
     if outside > counters["events"] or is_unreadable(counters) or _other_light(counters):
         return ""
-    lost = max(_LOSSES, key=lambda name: counters[name])
+    losses = [name for name in _LOSSES if name != "points_flagged" or settings.keep == "good"]
+    lost = max(losses, key=lambda name: counters[name])
     if modulated and not points and counters["columns_unmodulated"] > counters[lost]:
         return ""
     if 2 * counters["events_filtered"] > counters["events"]:

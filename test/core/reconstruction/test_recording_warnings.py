@@ -236,6 +236,13 @@ def test_a_contradiction_has_its_line(recording, change, settings, words, points
     assert sum(words in line for line in result.warnings) == 1, result.warnings
 
 
+def test_points_that_keep_leaves_out_are_the_cause_of_an_empty_cloud(tmp_path):
+    near_mm, _ = NARROW.model().range_limits_mm
+    recording = simulate_recording(tmp_path / "rec", Plane(near_mm + 0.5), NARROW, stop_mm=4.0)
+    result = reconstruct_recording(recording, Settings(keep="good"))
+    assert result.warnings[-1].endswith("points have a flag; set keep to all")
+
+
 @pytest.mark.parametrize(
     ("others", "idle"),
     [
