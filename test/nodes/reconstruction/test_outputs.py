@@ -4,11 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from line_events import blank_profiles
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, place
+from eschorty_ros.core.reconstruction import place
 from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
@@ -49,13 +50,9 @@ def timed(edges_us):
     count = edge_us.size
     column = np.tile(np.arange(COLUMNS, dtype=np.uint16), len(edges_us))
     t_us = edge_us + 100 - 10 * column.astype(np.int64)
-    profiles = Profiles(
-        period=edge_us, edge_us=edge_us, t_us=t_us, column=column, row=np.full(count, 300.0),
-        sigma_row=np.full(count, 0.1), events=np.full(count, 30, np.uint32),
-        width_px=np.full(count, 5.0), return_index=np.zeros(count, np.uint8),
-        flags=np.zeros(count, np.uint16), range_mm=1000.0 + np.arange(count),
-        sigma_mm=np.ones(count),
-    )  # fmt: skip
+    profiles = blank_profiles(
+        count, edge_us=edge_us, t_us=t_us, column=column, range_mm=1000.0 + np.arange(count)
+    )
     times = ZERO_NS + t_us * 1000, ZERO_NS + edge_us * 1000
     return TimedProfiles(profiles, *times, CALIBRATION.model(), CALIBRATION.stage_direction)
 
