@@ -143,8 +143,7 @@ class Profiles(LineRows):
     return_index : uint8
         Place among the points of the same profile and column, nearest range first.
     flags : uint16
-        Bits that state what makes a point worse than its neighbours (1: on two surfaces, 2: cut by
-        the sensor's edge, 4: few events); 0 for a good one.
+        Bits ``MIXED``, ``SENSOR_EDGE`` and ``FEW_EVENTS``; 0 for a good point.
     reflectance : float64, optional
         Relative reflectance; ``None`` where it is not estimated.
     reflectance_sigma : float64, optional
