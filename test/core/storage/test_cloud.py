@@ -126,14 +126,15 @@ def test_open3d_sees_the_same_points(tmp_path, extension, open3d):
 
 
 def test_headers_as_written(tmp_path):
-    write_cloud(tmp_path / "c.pcd", cloud(2))
-    write_cloud(tmp_path / "c.ply", cloud(2))
-    assert (tmp_path / "c.pcd").read_bytes()[:-64].decode() == (
+    points = cloud(2)
+    write_cloud(tmp_path / "c.pcd", points)
+    write_cloud(tmp_path / "c.ply", points)
+    assert (tmp_path / "c.pcd").read_bytes()[: -points.nbytes].decode() == (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
         "FIELDS x y z intensity sigma t column flags\nSIZE 4 4 4 4 4 8 2 2\nTYPE F F F F F F U U\n"
         "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
     )
-    assert (tmp_path / "c.ply").read_bytes()[:-64].decode() == (
+    assert (tmp_path / "c.ply").read_bytes()[: -points.nbytes].decode() == (
         "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
         "property float y\nproperty float z\nproperty float intensity\nproperty float sigma\n"
         "property double t\nproperty uint16 column\nproperty uint16 flags\nend_header\n"
