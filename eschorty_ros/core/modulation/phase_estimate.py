@@ -97,9 +97,11 @@ def _burst_begin(phase: NDArray[np.float64], weights: NDArray[np.float64], gap_b
     bins = np.minimum((phase * _HISTOGRAM_BINS).astype(np.int64), _HISTOGRAM_BINS - 1)
     counts = np.bincount(bins, weights, _HISTOGRAM_BINS)
     smooth = counts + np.roll(counts, 1) + np.roll(counts, -1)
-    peak = int(np.argmax(smooth))
+    # A burst may be in one bin: those beside it have as large sums, and only background.
+    around = (int(np.argmax(smooth)) + np.arange(-1, 2)) % _HISTOGRAM_BINS
+    peak = int(around[np.argmax(counts[around])])
     background = float(np.quantile(counts, 0.2))
-    level = background + 0.05 * (float(counts[peak]) - background)
+    level = background + 0.05 * (float(counts[around].mean()) - background)
     begin = peak
     for back in range(1, _HISTOGRAM_BINS // 2):
         before = (peak - back - np.arange(gap_bins)) % _HISTOGRAM_BINS

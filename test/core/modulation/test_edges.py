@@ -141,6 +141,17 @@ def test_a_burst_that_is_read_out_row_by_row_begins_with_its_first_row(row_us):
     assert abs((found.edge_us - 1000 + 100) % 200 - 100) <= 2
 
 
+@pytest.mark.parametrize("edge_us", range(20_000, 20_072, 8))
+def test_a_burst_of_a_microsecond_begins_with_its_events_and_not_with_the_background(edge_us):
+    """All its events are in one bin of the estimate."""
+    rng = np.random.default_rng(SEED)
+    burst = np.repeat(edge_us + np.rint(np.arange(6) * 1e6 / 70.0), 2000)
+    t = np.sort(np.concatenate([burst, rng.uniform(0, 100_000, 500)])).astype(np.int64)
+    found = estimate_phase(t, np.ones(t.size, np.uint8), Modulation(70.0))
+    error = (found.edge_us - edge_us + 7143) % 14286 - 7143
+    assert abs(error) < 100, f"seed {SEED}: {error:.0f} us"
+
+
 def test_window_does_not_depend_on_when_it_is_asked_for():
     rng = np.random.default_rng(SEED)
     t = np.sort(rng.integers(0, 10_000_000, 20_000))
