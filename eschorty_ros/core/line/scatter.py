@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
+from eschorty_ros.core.line.estimators import _mean
 from eschorty_ros.core.line.pixel_locking import Levels, _clear_levels, empty_levels
 
 # Columns from one to the next of those whose rows, or widths, are compared, and of close ones.
@@ -266,10 +267,34 @@ def _share_at(row, locking2):
 
 
 @kernel(_nrt=False)
-def _scale_smoothed(rows, scatter, smoothing, windowed):
+def _learned_variance(rows, block, step_px):
+    """Return the variance that learned rows near a block share: they differ from means together.
+
+    A line at rest shows its footprint at one place in a pixel alone, which draws the rows. Means of
+    a line that moves by ``step_px`` from profile to profile may lag by that.
+    """
+    total, squares, number = 0.0, 0.0, 0.0
+    begin, end = max((block - 2) * BLOCK_COLUMNS, 0), (block + 1) * BLOCK_COLUMNS
+    for c in range(np.uintp(begin), np.uintp(min(end, rows.row.shape[1]))):
+        mean = _mean(rows.events[0, c], rows.windows.first[0, c], rows.windows.d[0, c])
+        apart = rows.row[0, c] - mean
+        if apart * apart <= _PIXEL2 and not rows.truncated[0, c]:
+            total += apart
+            squares += apart * apart
+            number += 1.0
+    if number == 0.0:
+        return 0.0
+    together = total / number
+    chance2 = (squares / number - together * together) / number
+    return max(max(abs(together) - step_px, 0.0) ** 2 - chance2, 0.0)
+
+
+@kernel(_nrt=False)
+def _scale_smoothed(rows, scatter, smoothing, windowed, step_px, learned):
     """Scale the smoothed variances of a profile by the scatter left, as `_scale` does.
 
     They are no less than what all columns may share, which is in the scatter where the rows differ.
+    Rows may be ``learned``; the line moves by ``step_px``, by block, from profile to profile.
     """
     returns, columns = rows.row.shape
     near, far, sigma2 = scatter.near, scatter.far, smoothing.sigma2
@@ -280,10 +305,12 @@ def _scale_smoothed(rows, scatter, smoothing, windowed):
         ratio = _smoothed_ratio(scatter, block) if windowed else -1.0
         factor = ratio if ratio >= 0.0 else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
+        learned2 = _learned_variance(rows, block, step_px[block]) if learned else 0.0
         for k in range(returns):
             middle, locking2 = np.uintp((begin + end) // 2), scatter.levels.variance[block]
             locking2 *= _left_of_locking(smoothing.row[k], smoothing.used[k], middle)
             locking2 *= _share_at(smoothing.row[k, middle], locking2)
+            locking2 += learned2
             for c in range(np.uintp(begin), np.uintp(end)):
                 rows.common2[k, c] += 0.0 if rows.truncated[k, c] else locking2
                 own2, common2 = factor * sigma2[k, c], rows.common2[k, c]

@@ -36,6 +36,7 @@ from eschorty_ros.core.line.estimators import (
     half_width_fixed,
 )
 from eschorty_ros.core.line.learned import (
+    LEARNED_ROWS,
     MEAN_ROWS,
     UNDECIDED,
     Footprint,
@@ -481,7 +482,8 @@ def _close(memory):
     windowed = _is_windowed(estimator.method)
     _scale(rows, scatter, smoothing, windowed)
     _smooth(rows, smoothing)
-    _scale_smoothed(rows, scatter, smoothing, windowed)
+    learned = memory.footprint.state.choice == LEARNED_ROWS
+    _scale_smoothed(rows, scatter, smoothing, windowed, memory.history.step_px, learned)
     _follow(memory, half, sums.unmodulated > sums.line.lines)
     memory.columns.counts[:] = 0
     few = _few_events(rows, smoothing.isolation_events, state)

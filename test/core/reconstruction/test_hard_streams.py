@@ -243,6 +243,18 @@ def test_a_reflection_beside_the_line_does_not_pull_learned_rows():
     assert p95_px[1] < 1.1 * p95_px[0], f"seed {camera.seed}"
 
 
+@pytest.mark.parametrize("row", [350.4, 350.6])
+def test_sigma_holds_what_learned_rows_of_a_line_at_rest_are_off_by(row):
+    """It is learned at one place in a pixel, and the rows of all columns are off alike."""
+    camera = Camera(threshold=0.2, events_max=20, mismatch=0.08)
+    line = camera.line(lambda k, column: np.where(column < 400, row, np.nan))
+    found, _ = points(camera, line, centroid="learned")
+    found = found.select(found.period >= 16)
+    covered = np.mean(np.abs(found.row - row) < 2.0 * found.sigma_row)
+    print(f"off by {found.row.mean() - row:.3f} px, within 2 sigma {covered:.3f}")
+    assert covered > 0.85, f"seed {camera.seed}"
+
+
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
 def test_a_line_that_moves_while_it_is_lit_is_one_line(frequency_hz):
     """Its ON events are 20 rows from its OFF events."""
