@@ -20,7 +20,7 @@ from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.estimators import _mean
 from eschorty_ros.core.line.footprint_symmetry import _PLACES, _centre, _is_asymmetric
 from eschorty_ros.core.line.line_history import _mean_of_blocks
-from eschorty_ros.core.line.scatter import _median_difference
+from eschorty_ros.core.line.scatter import _learned_variance, _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
 # Counts that are separated; the last is that number or more.
@@ -58,6 +58,8 @@ _PAYS = np.sqrt(0.5)
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
 # than what its rows scatter.
 _FAST_PX = 0.5
+# Squared median size of the second differences of normal rows of variance one.
+_MEDIAN2 = 6.0 * 0.6745**2
 # Profiles that show it: the median of a profile's differences is known to some percent.
 _TRIALS = 2
 # Shares of the posterior by the logarithm below the best; less counts as none.
@@ -385,8 +387,21 @@ def _learn(footprint, rows, smoothed, sensor_rows, lit_displacement_px, half):
 
 
 @kernel(_nrt=True)
-def _choose(footprint, row, history, is_last, always):
-    """Choose between learned rows and the means ``row`` by those of some profiles with both.
+def _learned_scatter(learned, rows, used, history):
+    """Return the `_median_difference` of ``learned`` rows with what near columns share.
+
+    Smoothing leaves all of that: it counts as often as columns are ``used`` for a row.
+    """
+    shared2 = np.zeros(history.step_px.size)
+    for block in range(1, shared2.size - 1):
+        shared2[block] = _learned_variance(learned, rows, block, history.step_px[block])
+    mean2 = _mean_of_blocks(shared2, history.now.points) * np.mean(used[~np.isnan(learned)])
+    return np.sqrt(_median_difference(learned) ** 2 + _MEDIAN2 * mean2)
+
+
+@kernel(_nrt=True)
+def _choose(footprint, rows, used, history, is_last, always):
+    """Choose between learned rows and the means of ``rows`` by those of some profiles with both.
 
     With ``always`` it is the learned rows. It is the means where no profile up to the one that
     ``is_last`` has shown learned rows. Of a line that moves fast, by its ``history``, learned rows
@@ -396,8 +411,10 @@ def _choose(footprint, row, history, is_last, always):
     if state.choice != UNDECIDED:
         return False
     if state.trying > 0:
-        means, learned = _median_difference(row), _median_difference(row + footprint.trial)
+        row = rows.row[0]
+        means = _median_difference(row)
         if means < np.inf:
+            learned = _learned_scatter(row + footprint.trial, rows, used, history)
             state.scatter += np.int64(1e6 * means)
             state.scatter_learned += np.int64(1e6 * min(learned, 1e6))
             state.trials += 1

@@ -267,8 +267,8 @@ def _share_at(row, locking2):
 
 
 @kernel(_nrt=False)
-def _learned_variance(rows, block, step_px):
-    """Return the variance that learned rows near a block share: they differ from means together.
+def _learned_variance(learned, rows, block, step_px):
+    """Return the variance that ``learned`` rows near a block share: they differ from means alike.
 
     A line at rest shows its footprint at one place in a pixel alone, which draws the rows. Means of
     a line that moves by ``step_px`` from profile to profile may lag by that.
@@ -277,7 +277,7 @@ def _learned_variance(rows, block, step_px):
     begin, end = max((block - 2) * BLOCK_COLUMNS, 0), (block + 1) * BLOCK_COLUMNS
     for c in range(np.uintp(begin), np.uintp(min(end, rows.row.shape[1]))):
         mean = _mean(rows.events[0, c], rows.windows.first[0, c], rows.windows.d[0, c])
-        apart = rows.row[0, c] - mean
+        apart = learned[c] - mean
         if apart * apart <= _PIXEL2 and not rows.truncated[0, c]:
             total += apart
             squares += apart * apart
@@ -305,7 +305,7 @@ def _scale_smoothed(rows, scatter, smoothing, windowed, step_px, learned):
         ratio = _smoothed_ratio(scatter, block) if windowed else -1.0
         factor = ratio if ratio >= 0.0 else 1.0
         begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
-        learned2 = _learned_variance(rows, block, step_px[block]) if learned else 0.0
+        learned2 = _learned_variance(rows.row[0], rows, block, step_px[block]) if learned else 0.0
         for k in range(returns):
             middle, locking2 = np.uintp((begin + end) // 2), scatter.levels.variance[block]
             locking2 *= _left_of_locking(smoothing.row[k], smoothing.used[k], middle)

@@ -436,7 +436,8 @@ def _learn_line(memory, half, learns, is_last):
     estimator, rows, history = memory.estimator, memory.rows, memory.history
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
-    if _choose(footprint, rows.row[0], history, is_last and enough, always):
+    used = memory.smoothing.used[0]
+    if _choose(footprint, rows, used, history, is_last and enough, always):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:

@@ -915,6 +915,20 @@ def test_auto_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_path):
     assert error_mm["chosen"] == pytest.approx(error_mm["learned"], rel=0.02)
 
 
+def test_auto_takes_means_where_learned_rows_are_off_alike():
+    """They scatter less, but a line at rest draws them all to one place in a pixel."""
+    camera = Camera(half_width_px=4.0, threshold=0.15, events_max=20, mismatch=0.1)
+    line = camera.line(lambda k, column: np.where(column < 400, 350.36, np.nan))
+    means, learned, chosen = (
+        points(camera, line, **settings)[0]
+        for settings in ({"detail": "off"}, {"centroid": "learned"}, {})
+    )
+    np.testing.assert_array_equal(chosen.row, means.row)
+    off, off_learned = (np.median(np.abs(f.row - 350.36)[f.period >= 16]) for f in (means, learned))
+    print(f"means are off by {off:.3f} px, learned rows by {off_learned:.3f} px")
+    assert off < 0.7 * off_learned, f"seed {camera.seed}"
+
+
 def _cut_everywhere(camera: Camera, at: float) -> tuple[Profiles, np.ndarray, Reconstructor]:
     """Return points of a line near the sensor's edge, their errors in rows, and their source."""
     found, reconstructor = points(camera, camera.line(lambda k, c: at + 0.6 * np.sin(c / 40.0)))
