@@ -39,6 +39,7 @@ from eschorty_ros.core.line.window import (
     Sums,
     Window,
     _column,
+    _exceeds_background,
     _mean_shift,
     _pad,
 )
@@ -114,7 +115,8 @@ class LineSums(NamedTuple):
 class PeriodSums(NamedTuple):
     """Sums over the line of a period, and counts of columns.
 
-    Those with ``too_few_events`` are ``weak`` where two of these are at the line's row.
+    Those with ``too_few_events`` are ``weak`` where two of these are at the line's row, or three of
+    more.
     """
 
     line: LineSums
@@ -327,6 +329,18 @@ def _are_two_near(packed, start, events, centre, half):
     return near >= 2
 
 
+@kernel
+def _is_weak(window, column_events, half, estimator):
+    """Return whether a window has more events than background, but fewer than a point has.
+
+    Two may be background.
+    """
+    events = window.sums.events
+    return 2 < events < estimator.events_min and _exceeds_background(
+        events, column_events - events, half, estimator.rows_taken
+    )
+
+
 @kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out``.
@@ -383,6 +397,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
             few += found.status == TOO_FEW
+            weak += found.status == TOO_FEW and known and _is_weak(window, n, half, estimator)
             columns.events[c] = 0
             if not known:
                 columns.seeds[c] = -1

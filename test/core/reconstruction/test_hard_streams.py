@@ -318,6 +318,18 @@ def test_columns_of_a_line_without_enough_events_have_a_reason_with_their_number
     assert "fewer than events_min = 4 and gave no points" in warning
 
 
+def test_columns_of_a_line_without_enough_events_among_background_have_a_reason():
+    """Of 5 events on average 14 % of Poisson counts are 3; others are as many, in all rows."""
+    camera = Camera(periods=30)
+    background = camera.scattered(5.0 * COLUMNS * camera.frequency_hz)
+    line = _kept(camera, 0.13)
+    found, reconstructor = points(camera, line, background, periods_per_profile=1)
+    assert 0.6 < len(found) / (camera.periods * COLUMNS) < 0.9, f"seed {camera.seed}"
+    (warning,) = reconstructor.warnings
+    assert 0.1 < int(warning.split()[0]) / (camera.periods * COLUMNS) < 0.2
+    assert "fewer than events_min = 4 and gave no points" in warning
+
+
 @pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
 def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
     narrow = replace(CALIBRATION, columns=160, principal_column=None)
