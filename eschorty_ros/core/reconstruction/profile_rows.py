@@ -61,6 +61,7 @@ from eschorty_ros.core.line.line_history import (
     _restart_history,
     empty_history,
 )
+from eschorty_ros.core.line.one_end import _one_end_stays
 from eschorty_ros.core.line.pixel_locking import _measure_levels
 from eschorty_ros.core.line.scatter import (
     Scatter,
@@ -117,6 +118,7 @@ COUNTERS = (
     "periods_closed",
     "periods_empty",
     "profiles_too_wide",
+    "profiles_one_end",
     "columns_too_few_events",
     "columns_weak",
     "columns_ambiguous",
@@ -490,6 +492,7 @@ def _close(memory):
     few = _few_events(rows, smoothing.isolation_events, state)
     lit_share = memory.light.lit_share
     _mark_unusual(rows, smoothing, memory.widths, memory.history, few, lit_share, windowed)
+    counters.profiles_one_end += windowed and _one_end_stays(memory.history.now)
     if single > 0:
         _use_single_line(memory, single)
     followed = _points_followed(memory.history)

@@ -95,6 +95,13 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
             "points: the readout loses one side of the line, or the line is asymmetric; sigma "
             f"has the difference; {FEWER_EVENTS}"
         )
+    elif 2 * counts["profiles_one_end"] > counts["periods_closed"]:
+        found.append(
+            "one end of the line stays in the same rows while the other follows the surface, in "
+            f"{counts['profiles_one_end']} of {counts['periods_closed']} profiles: the readout "
+            "loses one side of the line, and its rows are off by up to half of its width, which "
+            f"sigma does not have; {FEWER_EVENTS}"
+        )
     elif 2 * counts["footprints_asymmetric"] > counts["footprints"]:
         found.append(
             "the mean of the line's rows is not in the middle of its ends: the readout loses one "

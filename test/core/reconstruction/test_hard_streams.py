@@ -779,6 +779,28 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
     assert len(warning) < 300
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_readout_that_ends_lines_at_one_row_has_a_warning(side):
+    """In each fortieth of a period it takes half of the events, those of the first or last rows."""
+
+    def waves(_, column):
+        return 350.3 + 6.0 * np.sin(4.0 * np.pi * column / COLUMNS)
+
+    camera = Camera(periods=20)
+    events = camera.line(waves)
+    slot = (events[0] / (camera.period_us / 40.0)).astype(int)
+    order = np.lexsort((side * events[2].astype(int), slot))
+    rank = np.arange(order.size) - np.searchsorted(slot[order], slot[order])
+    kept = order[2 * rank < np.bincount(slot)[slot[order]]]
+    found, reconstructor = points(camera, tuple(values[kept] for values in events))
+    error = np.abs(found.row - waves(found.period, found.column))
+    assert np.median(error) > 1.0, f"seed {camera.seed}"
+    (warning,) = reconstructor.warnings
+    assert "one end of the line stays in the same rows" in warning
+    _, reconstructor = points(camera, events)
+    assert not reconstructor.warnings
+
+
 def test_a_line_that_moves_at_1_khz_is_no_fault_of_the_readout(tmp_path):
     narrow = replace(CALIBRATION, columns=320, principal_column=None)
     scene, sweep = named("face", narrow.model()), (40.0, 44.0, 100.0)
