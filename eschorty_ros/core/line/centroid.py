@@ -115,8 +115,8 @@ class LineSums(NamedTuple):
 class PeriodSums(NamedTuple):
     """Sums over the line of a period, and counts of columns.
 
-    Those with ``too_few_events`` are ``weak`` where two of these are at the line's row, or three of
-    more.
+    Those with ``too_few_events`` are ``weak`` where two events are at the line's row, or three if
+    they have as many as a point needs, in all rows.
     """
 
     line: LineSums

@@ -310,8 +310,7 @@ def _scale_smoothed(rows, scatter, smoothing, windowed, step_px, learned):
             middle, locking2 = np.uintp((begin + end) // 2), scatter.levels.variance[block]
             locking2 *= _left_of_locking(smoothing.row[k], smoothing.used[k], middle)
             locking2 *= _share_at(smoothing.row[k, middle], locking2)
-            locking2 += learned2
             for c in range(np.uintp(begin), np.uintp(end)):
-                rows.common2[k, c] += 0.0 if rows.truncated[k, c] else locking2
+                rows.common2[k, c] += 0.0 if rows.truncated[k, c] else locking2 + learned2
                 own2, common2 = factor * sigma2[k, c], rows.common2[k, c]
                 sigma2[k, c] = max(common2, own2) if ratio >= 0.0 else common2 + own2
