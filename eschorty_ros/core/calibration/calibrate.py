@@ -251,8 +251,9 @@ def _refuse_mirrored(targets: Targets, design: RangeModel) -> None:
         near, far = (int(pick(targets.range_mm)) for pick in (np.argmin, np.argmax))
         raise FitError(
             f"rows fall with range, from {targets.row[near]:.1f} at {targets.range_mm[near]:g} mm "
-            f"to {targets.row[far]:.1f} at {targets.range_mm[far]:g} mm: where they are counted "
-            f"from the sensor's other end write {design.rows - 1} - row, else correct the ranges"
+            f"to {targets.row[far]:.1f} at {targets.range_mm[far]:g} mm: turn a camera "
+            f"that is upside down; where rows are counted from the sensor's other end write "
+            f"{design.rows - 1} - row, else correct the ranges"
         )
 
 

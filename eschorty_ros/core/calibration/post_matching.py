@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -91,7 +91,8 @@ def match_posts(
     - ``nominal``: The build as designed: ``kk'`` holds within 15 %, ``b'`` within 120 rows.
 
     Raises ``ArgumentError`` when nothing is known, or two known targets have the same range and no
-    hints. Raises ``FitError`` when the posts agree with the known ranges in more than one way.
+    hints. Raises ``FitError`` when the posts agree with the known ranges in more than one way, or
+    as those of a camera that is upside down.
     """
     if not known:
         raise ArgumentError("known is empty; give the targets' ranges")
@@ -100,11 +101,36 @@ def match_posts(
     free_posts = [i for i, post in enumerate(posts) if i not in matched and not post.row_cut]
     free_known = [j for j, target in enumerate(known) if not target.hinted]
     _refuse_equal_ranges([known[j] for j in free_known])
-    search = _LineSearch([posts[i] for i in free_posts], [known[j] for j in free_known], nominal)
-    pairs += [(free_posts[i], free_known[j]) for i, j in search.best()]
+    free = [posts[i] for i in free_posts], [known[j] for j in free_known], nominal
+    search = _LineSearch(*free)
+    try:
+        found = search.best()
+    except FitError:
+        _refuse_upside_down(*free)
+        raise
+    pairs += [(free_posts[i], free_known[j]) for i, j in found]
     pairs.sort(key=lambda pair: known[pair[1]].range_mm)
     rejected = _left_over(posts, known, pairs, search)
     return PostMatch(_targets(posts, known, pairs), tuple(pairs), rejected)
+
+
+def _refuse_upside_down(
+    posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
+) -> None:
+    turned = [
+        replace(post, row=nominal.rows - 1 - post.row, column=nominal.columns - 1 - post.column)
+        for post in posts
+    ]
+    try:
+        agreeing = len(_LineSearch(turned, known, nominal).best())
+    except FitError:
+        return
+    # A line goes through any two.
+    if agreeing > 2:
+        raise FitError(
+            f"{agreeing} posts agree with the known ranges with the image turned by 180 degrees: "
+            "the camera is upside down; turn it"
+        ) from None
 
 
 def _by_hint(posts: Sequence[Post], known: Sequence[KnownTarget]) -> list[tuple[int, int]]:

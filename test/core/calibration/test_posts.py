@@ -210,6 +210,15 @@ def test_a_post_that_the_edge_of_the_columns_cuts_keeps_its_row_and_column_alone
     assert np.isnan(targets.width_px).tolist() == [True, False, False]
 
 
+def test_posts_of_a_camera_that_is_upside_down_are_refused(frame):
+    turned = [
+        replace(post, row=719.0 - post.row, column=1279.0 - post.column)
+        for post in find_posts(frame)
+    ]
+    with pytest.raises(FitError, match=r"^9 posts agree .* the camera is upside down; turn it$"):
+        match_posts(turned, [replace(known, size_mm=np.nan) for known in KNOWN], NOMINAL)
+
+
 def test_no_post_at_all_is_no_error_here():
     result = match_posts([], ranges(1000.0, 1500.0), NOMINAL)
     assert result.targets is None
