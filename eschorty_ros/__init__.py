@@ -47,7 +47,7 @@ _PLACES = {
         "POINT_DTYPE", "Recording", "load_recording", "read_cloud", "write_cloud",
         "write_laser_yaml", "write_stage_csv",
     ),
-    "core.storage.raw_file": ("RawReader",),
+    "core.storage.raw_file": ("RawReader", "write_events_raw"),
 }  # fmt: skip
 _PLACE = {name: place for place, names in _PLACES.items() for name in names}
 __all__ = sorted(_PLACE)

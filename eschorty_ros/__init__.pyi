@@ -20,5 +20,6 @@ from eschorty_ros.core.storage import write_cloud as write_cloud
 from eschorty_ros.core.storage import write_laser_yaml as write_laser_yaml
 from eschorty_ros.core.storage import write_stage_csv as write_stage_csv
 from eschorty_ros.core.storage.raw_file import RawReader as RawReader
+from eschorty_ros.core.storage.raw_file import write_events_raw as write_events_raw
 
 __version__: str

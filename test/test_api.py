@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import eschorty_ros as es
+from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -27,6 +28,20 @@ def test_settings_are_checked_and_an_empty_cloud_is_not_saved(tmp_path):
     plain = es.reconstruct(tmp_path)
     assert np.median(plain.points["x"] - other.points["x"]) == pytest.approx(5e-3, abs=1e-6)
     assert "given as 71 Hz" in es.reconstruct(tmp_path, frequency_hz=71.0).warnings[0]
+
+
+def test_events_of_another_camera_in_any_order_give_the_same_points(tmp_path):
+    print("seed 5")
+    other = replace(es.load_calibration("config_3"), columns=96, principal_column=None)
+    recording = simulate_recording(tmp_path, Plane(1300.0), other, stop_mm=12.0)
+    points = es.reconstruct(tmp_path).points
+    events = Decoder(96, 720).decode(b"".join(es.RawReader(recording.events_path)))
+    order = np.random.default_rng(5).permutation(events.t.size)
+    arrays = (values[order] for values in (events.t, events.x, events.y, events.p > 0))
+    es.write_events_raw(recording.events_path, *arrays, columns=96, rows=720)
+    again = es.reconstruct(tmp_path).points
+    assert points.size > 1000
+    np.testing.assert_array_equal(again, points)
 
 
 def test_settings_may_be_numpys_numbers_and_a_wrong_type_is_one_line():

@@ -13,18 +13,26 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from eschorty_ros.core.base.arrays import byte_view
-from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.base.files import GrowingFile, open_regular_file
+import numpy as np
+from numpy.typing import ArrayLike
+
+from eschorty_ros.core.base.arrays import byte_view, integer_vector
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.files import GrowingFile, atomic_write, open_regular_file
 from eschorty_ros.core.base.numbers import file_path, integer
+from eschorty_ros.core.evt3 import Encoder, EventArrays, sort_readout
 from eschorty_ros.core.evt3 import words as w3
 
 CHUNK_BYTES = 128 * 1024
 _HEADER_MAX_BYTES = 64 * 1024
 _SIZE_MAX = 2048
+# A decoder takes the first time as less than what 24 bits hold.
+_BEGIN_MAX_US = (1 << 24) - 1
+_TIME_MAX_US = 1 << 60
+_EVENTS_AT_ONCE = 1 << 20
 _GZIP = b"\x1f\x8b"
 _VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
-_REMEDY = "convert it to EVT3 or record again with format EVT3"
+_REMEDY = "record with format EVT3, or write its events with eschorty_ros.write_events_raw"
 
 
 class Header(Mapping[str, str]):
@@ -237,26 +245,93 @@ class RawWriter(GrowingFile):
             integer(name, size, 1, _SIZE_MAX)
         super().__init__(file_path("path", path))
         self.bytes_written = 0
-        header = {
-            "camera_integrator_name": "Prophesee",
-            "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S"),
-            "evt": "3.0",
-            "format": f"EVT3;height={height};width={width}",
-            "generation": "4.2",
-            "geometry": f"{width}x{height}",
-            "integrator_name": "Prophesee",
-            "plugin_integrator_name": "Prophesee",
-            "plugin_name": "hal_plugin_prophesee",
-            "sensor_generation": "4.2",
-            "sensor_name": "IMX636",
-            "serial_number": "00000000",
-            "system_ID": "49",
-        }
-        lines = "".join(f"% {key} {value}\n" for key, value in header.items()) + "% end\n"
-        super().write(lines.encode("ascii"))
+        super().write(_header(width, height))
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Append bytes of the stream, all or none."""
         view = byte_view("data", data)
         super().write(view)
         self.bytes_written += len(view)
+
+
+def _header(width: int, height: int) -> bytes:
+    header = {
+        "camera_integrator_name": "Prophesee",
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S"),
+        "evt": "3.0",
+        "format": f"EVT3;height={height};width={width}",
+        "generation": "4.2",
+        "geometry": f"{width}x{height}",
+        "integrator_name": "Prophesee",
+        "plugin_integrator_name": "Prophesee",
+        "plugin_name": "hal_plugin_prophesee",
+        "sensor_generation": "4.2",
+        "sensor_name": "IMX636",
+        "serial_number": "00000000",
+        "system_ID": "49",
+    }
+    lines = "".join(f"% {key} {value}\n" for key, value in header.items())
+    return f"{lines}% end\n".encode("ascii")
+
+
+def write_events_raw(
+    path: str | os.PathLike[str],
+    t_us: ArrayLike,
+    column: ArrayLike,
+    row: ArrayLike,
+    polarity: ArrayLike,
+    columns: int = 1280,
+    rows: int = 720,
+) -> None:
+    """Write ``events.raw`` at ``path`` from events of any camera.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    t_us : array_like of int, shape (n,)
+        Sensor time from 0 on, in any order; the first event within 16 s.
+    column, row : array_like of int, shape (n,)
+        Pixel; the first row sees the nearest range.
+    polarity : array_like of bool or int, shape (n,)
+        1 where the light increases, else 0.
+    columns, rows : int
+        Sensor size in pixels, that of the calibration, up to 2048.
+
+    Raises
+    ------
+    ArgumentError
+        When there are no events, the arrays differ in length, a value is outside its range, more
+        than an hour passes without events or the path cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_events_raw(f"{folder}/events.raw", [100, 230], [639, 640], [350, 351], [1, 0])
+    ...     sum(map(len, RawReader(f"{folder}/events.raw")))
+    14
+    """
+    columns, rows = integer("columns", columns, 1, _SIZE_MAX), integer("rows", rows, 1, _SIZE_MAX)
+    events = EventArrays(
+        integer_vector("t_us", t_us, np.int64, 0, _TIME_MAX_US),
+        integer_vector("column", column, np.uint16, 0, columns - 1),
+        integer_vector("row", row, np.uint16, 0, rows - 1),
+        integer_vector("polarity", polarity, np.uint8, 0, 1),
+    )
+    sizes = [values.size for values in events]
+    if len(set(sizes)) > 1 or not sizes[0]:
+        raise ArgumentError(
+            f"t_us, column, row, polarity have {sizes} entries; give one of each per event"
+        )
+    begin_us = int(events.t.min())
+    if begin_us > _BEGIN_MAX_US:
+        raise ArgumentError(
+            f"t_us begins at {begin_us}; subtract that, also from the stage's times"
+        )
+    events = sort_readout(*events)
+    encoder = Encoder(columns, rows)
+    with atomic_write(path) as raw:
+        raw.write(_header(columns, rows))
+        for begin in range(0, sizes[0], _EVENTS_AT_ONCE):
+            raw.write(encoder.encode(*(v[begin : begin + _EVENTS_AT_ONCE] for v in events)))

@@ -3,11 +3,13 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from streams import words_of
 
-from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter, write_events_raw
 
 WORDS = words_of("8000 6064 002A 2805")
 NEW = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
@@ -129,6 +131,42 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
     }.items() <= dict(reader.header).items()  # fmt: skip
     keys = [line.split()[1] for line in path.read_bytes().split(b"% end\n")[0].splitlines()]
     assert keys == sorted(keys)
+
+
+def test_events_of_another_camera_read_back_in_readout_order(tmp_path: Path) -> None:
+    print("seed 5")
+    rng = np.random.default_rng(5)
+    n = (1 << 20) + 1000  # more than are encoded at once
+    t = rng.permutation(n) * 20
+    x, y, on = rng.integers(0, 346, n), rng.integers(0, 260, n), rng.random(n) < 0.5
+    write_events_raw(tmp_path / "events.raw", t, x, y, on, columns=346, rows=260)
+    reader = RawReader(tmp_path / "events.raw")
+    assert (reader.header.width, reader.header.height) == (346, 260)
+    assert reader.warnings == []
+    events = Decoder(346, 260).decode(b"".join(reader))
+    order = np.argsort(t)
+    for read, written in zip((events.t, events.x, events.y, events.p), (t, x, y, on), strict=True):
+        np.testing.assert_array_equal(read, written[order])
+
+
+@pytest.mark.parametrize(
+    ("events", "said"),
+    [
+        (([], [], [], []), "[0, 0, 0, 0] entries"),
+        (([1, 2], [3, 4], [5, 6], [1]), "[2, 2, 2, 1] entries"),
+        (([1 << 40], [3], [5], [1]), "t_us begins at 1099511627776; subtract that"),
+        (([1, 1 << 33], [3, 4], [5, 6], [0, 1]), "stay within 3600000000 us"),
+        (([0.5], [3], [5], [1]), "give one axis of integers"),
+        (([1], [1280], [5], [1]), "column holds 1280; choose 0 to 1279"),
+        (([1], [3], [5], [-1]), "polarity holds -1; choose 0 to 1"),
+    ],
+)
+def test_wrong_events_leave_the_file_as_it_is(tmp_path: Path, events, said: str) -> None:
+    (tmp_path / "events.raw").write_text("the last good one")
+    with pytest.raises(ArgumentError) as caught:
+        write_events_raw(tmp_path / "events.raw", *events)
+    assert said in str(caught.value)
+    assert (tmp_path / "events.raw").read_text() == "the last good one"
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
