@@ -143,7 +143,8 @@ class ProfileAssembler:
         known["choice"] = self._first_choice
         known["computations"] = known["all_cut"] = 0
         self._memory.footprint.state["near_edge"] = 0
-        self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
+        for name in ("points", "points_most", "known_half", "known_one_end"):
+            self._state[name] = 0
         self._memory.known_widths.number[:] = 0.0
         self._memory.known_widths.scale[:] = 1.0
         self._memory.known_widths.typical["difference"] = 0.0
@@ -165,7 +166,8 @@ class ProfileAssembler:
                 counters=record(*COUNTERS),
             )
         )
-        self._state["known_half"] = before._memory.state["known_half"]
+        for name in ("known_half", "known_one_end"):
+            self._state[name] = before._memory.state[name]
         self._memory.columns.counts[:] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["status"] = CLOSED

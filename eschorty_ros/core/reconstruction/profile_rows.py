@@ -61,7 +61,7 @@ from eschorty_ros.core.line.line_history import (
     _restart_history,
     empty_history,
 )
-from eschorty_ros.core.line.one_end import _one_end_stays
+from eschorty_ros.core.line.one_end import _end_that_stays, _restore_ends
 from eschorty_ros.core.line.pixel_locking import _measure_levels
 from eschorty_ros.core.line.scatter import (
     Scatter,
@@ -144,6 +144,8 @@ _STATE = (
     "full",  # 1 while a column needs more room
     "window",  # events since the estimate of the line started
     "profiles",  # since then
+    "one_end",  # profiles since then whose lines have lost one end
+    "known_one_end",  # 1 where most of the first window have
     "over",  # 1 where a pass ended with the window
     "points",  # since the restart
     "points_most",  # the most of a profile
@@ -260,7 +262,7 @@ def first_choice(settings: Settings) -> int:
 def _begin_window(memory):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
     state = memory.state
-    state.window = state.profiles = state.recent_points = state.recent_events = 0
+    state.window = state.profiles = state.one_end = state.recent_points = state.recent_events = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.second_rows[:], memory.columns.events[:] = -1, 0
@@ -428,6 +430,12 @@ def _follow(memory, half, restarted):
 
 
 @kernel(inline="always")
+def _loses_one_end(state):
+    """Return whether all but one in 16 profiles of the window have one end in the same rows."""
+    return state.profiles >= _RECENT * max(state.profiles - state.one_end, 1)
+
+
+@kernel(inline="always")
 def _learn_line(memory, half, learns, is_last):
     """Learn the footprint, the widths and the gate, and keep what later windows begin with.
 
@@ -456,8 +464,21 @@ def _learn_line(memory, half, learns, is_last):
             _clear_usual(memory)
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
+            state.known_one_end = _loses_one_end(state)
             _keep_widths(memory.widths, memory.known_widths)
             _keep_gate(memory.gate)
+
+
+@kernel(inline="always")
+def _lost_end(memory):
+    """Return the end that the readout loses of the lines, as in almost all profiles; 0 for none.
+
+    Edges of a scene may leave one end where it is in some.
+    """
+    state, end = memory.state, _end_that_stays(memory.history.now)
+    memory.counters.profiles_one_end += end != 0
+    state.one_end += end != 0
+    return end if _loses_one_end(state) or state.known_one_end > 0 else 0
 
 
 @kernel(_nrt=False)
@@ -492,7 +513,7 @@ def _close(memory):
     few = _few_events(rows, smoothing.isolation_events, state)
     lit_share = memory.light.lit_share
     _mark_unusual(rows, smoothing, memory.widths, memory.history, few, lit_share, windowed)
-    counters.profiles_one_end += windowed and _one_end_stays(memory.history.now)
+    end = _lost_end(memory) if windowed else 0
     if single > 0:
         _use_single_line(memory, single)
     followed = _points_followed(memory.history)
@@ -501,6 +522,8 @@ def _close(memory):
     counters.points_one_polarity += followed.of_one_polarity
     _learn_line(memory, half, learns, is_last)
     delay_us = _delay_us(rows, memory.delay, memory.light)
+    if end != 0:
+        _restore_ends(rows, smoothing, memory.history.now, end)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
     points = np.int64(state.rows - before)

@@ -99,8 +99,9 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
         found.append(
             "one end of the line stays in the same rows while the other follows the surface, in "
             f"{counts['profiles_one_end']} of {counts['periods_closed']} profiles: the readout "
-            "loses one side of the line, and its rows are off by up to half of its width, which "
-            f"sigma does not have; {FEWER_EVENTS}"
+            "loses one side of the line, and rows are off by up to half of its width, which sigma "
+            "does not have, or estimated from the other side, with the flag mixed; "
+            f"{FEWER_EVENTS}"
         )
     elif 2 * counts["footprints_asymmetric"] > counts["footprints"]:
         found.append(
