@@ -3,10 +3,11 @@
 All events of a line that is at rest and symmetric have the same mean row. Where a readout takes
 fewer events than the pixels give, and loses them in the order of the rows, those at the height of
 the burst have lost one side of the line, and the later ones have not. What the bursts of both
-polarities show is an uncertainty of the row; one of them alone differs where pixels answer the two
-edges of the laser differently. A line that passes an edge has lost one side, too, but not to the
-readout: the sums start again after the edge. Early events of a line that moves are ahead of the
-late ones, as pixels that were lit before answer later, which is an uncertainty but no fault.
+polarities show is an uncertainty of the row, and moves it to the late events; one of them alone
+differs where pixels answer the two edges of the laser differently. A line that passes an edge has
+lost one side, too, but not to the readout: the sums start again after the edge. Early events of a
+line that moves are ahead of the late ones, as pixels that were lit before answer later, which is an
+uncertainty but no fault.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ _KEPT = 1.0 - 1.0 / 16.0
 _BURST = 1 << 30
 # Where late events begin, at first, and the share of its value by which an event moves that.
 _LATE = 1 << 26
-_STEP = 1.0 / 128.0
+_STEP = 1.0 / 32.0
+# Share of the events of a burst that are early.
+_EARLY_SHARE = 0.75
 # Difference of both parts over the standard deviation by which whole pixels move the mean row.
 _EXPLAINED = 12.0
 # Profiles without which a shift is chance. From then on one of as many is added.
@@ -59,7 +62,7 @@ class Followed(NamedTuple):
 class Bursts(NamedTuple):
     """Sums over recent profiles by block of columns, polarity and part of the burst.
 
-    Early events, part 0, are before the phase ``late``, of 2**32 per turn: three of four. The first
+    Early events, part 0, are before the phase ``late``, of 2**32 per turn. The first
     and the last block are outside the sensor. ``profiles`` is how many the sums of a block are of.
     """
 
@@ -93,7 +96,7 @@ def _add_sums(bursts, block, polarity, early, late, origin_px):
         bursts.rows_px[block, polarity, part] += (
             np.int64(both & (_ONE - np.uint32(1))) + n * origin_px
         )
-        more_late += 3.0 * n if part else -n
+        more_late += n * _EARLY_SHARE if part else n * (_EARLY_SHARE - 1.0)
     bursts.late[block, polarity] *= 1.0 + _STEP * more_late
 
 
@@ -137,17 +140,43 @@ def _difference(bursts, block, polarity, explained_px):
     return np.sign(difference) * max(abs(difference) - explained_px, 0.0)
 
 
+@kernel(inline="always")
+def _is_followed(history, block):
+    """Return whether a block has had points for so long that its sums show losses."""
+    return history.recent.profiles[block] >= RECENT_PROFILES
+
+
+@kernel(inline="always")
+def _lost_shift_px(history, block):
+    """Return how far the early rows of a block are from the late ones by losses, px.
+
+    Those of a line that moves are ahead of the late ones without losses.
+    """
+    moved_px = history.recent.last[block] - history.recent.row[block]
+    ahead = history.step_px[block] > 0.0 and history.shift_px[block] * moved_px > 0.0
+    return 0.0 if ahead else history.shift_px[block]
+
+
+@kernel(_nrt=False)
+def _use_late_rows(row, history):
+    """Move rows to those of late events, of which the readout loses fewer."""
+    returns, columns = row.shape
+    for k in range(returns):
+        for c in range(np.uintp(columns)):
+            block = c // BLOCK_COLUMNS + 1
+            if _is_followed(history, block):
+                row[k, c] -= _EARLY_SHARE * _lost_shift_px(history, block)
+
+
 @kernel(_nrt=False)
 def _points_followed(history):
     """Return the points where the sums are of enough profiles, by what the sums show."""
     followed, shifted, of_one = 0.0, 0.0, 0.0
     for block in range(1, history.shift_px.size - 1):
-        if history.recent.profiles[block] >= RECENT_PROFILES:
+        if _is_followed(history, block):
             points = history.now.points[block]
             followed += points
-            moved_px = history.recent.last[block] - history.recent.row[block]
-            ahead = history.step_px[block] > 0.0 and history.shift_px[block] * moved_px > 0.0
-            shifted += points if history.shift_px[block] != 0.0 and not ahead else 0.0
+            shifted += points if _lost_shift_px(history, block) != 0.0 else 0.0
             of_one += points if _has_one_polarity(history.polarities, block) else 0.0
     return Followed(np.int64(followed), np.int64(shifted), np.int64(of_one))
 

@@ -15,6 +15,7 @@ from eschorty_ros.core.line.burst_shift import (
     _clear_bursts,
     _compare_bursts,
     _points_followed,
+    _use_late_rows,
     empty_bursts,
 )
 from eschorty_ros.core.line.centroid import (
@@ -522,6 +523,7 @@ def _close(memory):
     counters.points_one_polarity += followed.of_one_polarity
     _learn_line(memory, half, learns, is_last)
     delay_us = _delay_us(rows, memory.delay, memory.light)
+    _use_late_rows(smoothing.row, memory.history)
     if end != 0:
         _restore_ends(rows, smoothing, memory.history.now, end)
     before = state.rows

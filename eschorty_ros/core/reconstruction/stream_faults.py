@@ -92,15 +92,14 @@ def stream_faults(counts: Mapping[str, int]) -> list[str]:
     elif share > _BURST_SHIFT_SHARE:
         found.append(
             f"early and late events of a burst have different rows in {share:.0%} of the "
-            "points: the readout loses one side of the line, or the line is asymmetric; sigma "
-            f"has the difference; {FEWER_EVENTS}"
+            "points: the readout loses one side of the line, or the line is asymmetric; rows are "
+            f"those of late events; {FEWER_EVENTS}"
         )
     elif 2 * counts["profiles_one_end"] > counts["periods_closed"]:
         found.append(
-            "one end of the line stays in the same rows while the other follows the surface, in "
+            "one end of the line stays in the same rows, while the other is the surface's, in "
             f"{counts['profiles_one_end']} of {counts['periods_closed']} profiles: the readout "
-            "loses one side of the line, and rows are off by up to half of its width, which sigma "
-            "does not have, or estimated from the other side, with the flag mixed; "
+            "loses it; rows are wrong, or estimated from the other end with the flag mixed; "
             f"{FEWER_EVENTS}"
         )
     elif 2 * counts["footprints_asymmetric"] > counts["footprints"]:
