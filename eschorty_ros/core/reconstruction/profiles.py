@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, Self, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, Self, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -173,10 +173,20 @@ class Profiles(LineRows):
         return int(np.count_nonzero(edge_us[1:] != edge_us[:-1])) + 1 if len(self) else 0
 
 
+def _innermost(hint: Any) -> Any:
+    """Return the last argument of ``hint``, at any depth: that of an array is its scalar type.
+
+    From numpy 2.5 on, with Python 3.12, ``NDArray`` is an alias with one argument.
+    """
+    while arguments := get_args(hint):
+        hint = arguments[-1]
+    return hint
+
+
 _DTYPES = {
-    name: get_args(get_args(hint)[1])[0]
+    name: scalar
     for name, hint in get_type_hints(Profiles).items()
-    if get_origin(hint) is np.ndarray
+    if issubclass(scalar := _innermost(hint), np.generic)
 }
 """Type of each array of `Profiles` but the optional ones."""
 
