@@ -108,6 +108,8 @@ def match_posts(
     except FitError:
         _refuse_upside_down(*free)
         raise
+    if not found:
+        _refuse_upside_down(*free)
     pairs += [(free_posts[i], free_known[j]) for i, j in found]
     pairs.sort(key=lambda pair: known[pair[1]].range_mm)
     rejected = _left_over(posts, known, pairs, search)
@@ -129,7 +131,8 @@ def _refuse_upside_down(
     if agreeing > 2:
         raise FitError(
             f"{agreeing} posts agree with the known ranges with the image turned by 180 degrees: "
-            "the camera is upside down; turn it"
+            "turn a camera that is upside down; where rows are counted from the sensor's other end "
+            f"write {nominal.rows - 1} - row"
         ) from None
 
 
