@@ -287,16 +287,17 @@ def _posts(source: Path, design: Calibration, distances: str | None, range_sigma
     """Return the posts that are found in a recording; print which are left out."""
     from eschorty_ros.core.calibration import recorded_posts
 
+    known = _known(distances, range_sigma)
     with _reading(source, design) as (recording, progress):
-        match = recorded_posts(recording, _known(distances, range_sigma), design, progress)
+        match = recorded_posts(recording, known, design, progress)
     for line in match.rejected:
         click.echo(f"left out: {line}")
     if match.targets is None:
         near_mm, far_mm = design.model().range_limits_mm
-        raise FitError(
-            f"--distances is {distances}; no post is there; give millimetres, {near_mm:.0f} to "
-            f"{far_mm:.0f} with this --nominal"
-        )
+        remedy = f"give millimetres, {near_mm:.0f} to {far_mm:.0f} with this --nominal"
+        if any(near_mm <= target.range_mm <= far_mm for target in known):
+            remedy = "check them, and --nominal"
+        raise FitError(f"--distances is {distances}; no post is there; {remedy}")
     return match.targets
 
 

@@ -12,7 +12,10 @@ from click.testing import CliRunner
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.calibration import DISTANCE_COLUMNS, PRIOR_SIGMA, TARGET_COLUMNS
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration, save_calibration
+from eschorty_ros.core.storage import write_laser_yaml, write_stage_csv
+from eschorty_ros.core.storage.raw_file import write_events_raw
 from eschorty_ros.simulation.scenes import Plane, Posts, bench
 from eschorty_ros.simulation.world import simulate_recording
 
@@ -107,6 +110,31 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
     print(f"with sizes {rms_mm(with_sizes, AS_BUILT):.2f} mm, k {with_sizes.k_mm:.3f} mm")
     assert rms_mm(with_sizes, AS_BUILT) < 1.0
     assert with_sizes.k_mm == pytest.approx(AS_BUILT.object_scale_mm, rel=0.01)
+
+
+def test_posts_that_fit_no_distances_and_events_of_another_sensor_are_one_line(tmp_path):
+    folder = tmp_path / "posts"
+    folder.mkdir()
+    save_calibration(NOMINAL, folder / "calibration.yaml")
+    write_laser_yaml(folder / "laser.yaml", Modulation(70.0))
+    write_stage_csv(folder / "stage.csv", [0, 10**6], [10.0, 20.0])
+    rows = np.rint(AS_BUILT.model().row([900.0, 1200.0, 1500.0])).astype(int)
+    # Three posts of 40 columns and 5 rows, 30 events in each pixel.
+    column = np.add.outer(np.array([200, 600, 1000]), np.tile(np.arange(40), 150)).ravel()
+    row = np.add.outer(rows, np.repeat(np.arange(-2, 3), 1200)).ravel()
+    events = np.arange(row.size), column, row, np.arange(row.size) % 2
+    write_events_raw(folder / "events.raw", *events, columns=1280, rows=720)
+    for distances, remedy in (
+        ("0.9,1.2,1.5", "give millimetres, 785 to 2116"),
+        ("930,940,950", "check them"),
+    ):
+        done = run(folder, "--distances", distances, "--out", tmp_path / "made.yaml")
+        assert done.exit_code == 1
+        assert f"--distances is {distances}; no post is there; {remedy}" in done.stderr
+    write_events_raw(folder / "events.raw", *events, columns=1281, rows=720)
+    done = run(folder, "--distances", "900,1200,1500", "--out", tmp_path / "made.yaml")
+    assert done.exit_code == 1
+    assert "events.raw is of a sensor of 1281 x 720 and config_3 of one of 1280" in done.stderr
 
 
 def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):

@@ -32,16 +32,17 @@ def recorded_posts(
     - ``nominal``: The design of the build that made the recording.
     - ``progress``: Called with bytes read so far and bytes in all.
 
-    Raises ``CalibrationError`` when the design has another sensor. Raises ``FitError`` when no post
-    is found, or the posts agree with the ranges in more than one way. Raises ``FormatError`` when
-    the event file is not EVT3.
+    Raises ``CalibrationError`` when the design has another sensor than the events. Raises
+    ``FitError`` when no post is found, or the posts agree with the ranges in more than one way.
+    Raises ``FormatError`` when the event file is not EVT3.
     """
-    made = recording.calibration
+    made, reader = recording.calibration, RawReader(recording.events_path)
     refuse_other_sensor(str(recording.path), made.columns, made.rows, nominal)
+    refuse_other_sensor(str(recording.events_path), *reader.header.named_size, nominal)
     frame = AggregateFrame(nominal.columns, nominal.rows)
     decoder = Decoder(nominal.columns, nominal.rows)
     total, done = recording.events_path.stat().st_size, 0
-    for chunk in RawReader(recording.events_path).chunks(_CHUNK_BYTES):
+    for chunk in reader.chunks(_CHUNK_BYTES):
         frame.add(decoder.decode(chunk))
         done += len(chunk)
         if progress is not None:
