@@ -270,8 +270,10 @@ def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> 
     CalibrationError
         When the file would not read back as the same calibration.
     ArgumentError
-        When the path cannot be written.
+        For what is no `Calibration`, or when the path cannot be written.
     """
+    if not isinstance(calibration, Calibration):
+        raise ArgumentError(f"calibration is {short(calibration)}; give a Calibration")
     file = file_path("path", path)
     data = calibration.as_dict()
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True)

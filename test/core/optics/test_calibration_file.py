@@ -72,6 +72,12 @@ def test_saving_and_loading_gives_the_same(tmp_path, make):
     assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
 
 
+def test_what_is_no_calibration_is_not_saved(tmp_path):
+    with pytest.raises(ArgumentError, match=r"calibration is 'config_3'; give a Calibration"):
+        save_calibration("config_3", tmp_path / "c.yaml")
+    assert not (tmp_path / "c.yaml").exists()
+
+
 def test_numbers_survive_to_the_last_bit(tmp_path):
     odd = replace(
         fitted(), k_prime_px=-37261.86 * (1 + 2**-52), b_mm=1e-7 / 3, residual_rms_px=1e22
