@@ -56,7 +56,7 @@ def stage_faults(recording: Recording, span_us: tuple[int, int]) -> list[str]:
     if logged_us > _OTHER_UNIT * events_us:
         found.append(
             f"stage.csv covers {logged_us * 1e-6:.3g} s and the events {events_us * 1e-6:.3g} s; "
-            f"where t_us is in nanoseconds, write microseconds, else copy {name} again"
+            f"write the times of both in microseconds, or copy {name} again"
         )
         return found
     after = position_mm[np.searchsorted(t_us, end_us + _LEFT_US) :]

@@ -208,7 +208,7 @@ def test_stage_positions_of_a_later_wrap_of_the_cameras_clock_are_those_of_the_e
         (lambda r: with_edge(r, -5000), {}, "us before the edge that the events show", 1),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
-        (lambda r: with_stage(r, 999 * r.stage_samples["t_us"]), {}, "in nanoseconds, write", 1),
+        (lambda r: with_stage(r, 999 * r.stage_samples["t_us"]), {}, "times of both in micro", 1),
         (lambda r: with_half_of_the_events(r), {}, "mm after that; where these were scanned", 1),
         (lambda r: with_stage(r, 0, scale=1e-3), {}, "moves by 0.03 mm in stage.csv; where", 1),
         (lambda r: with_half_of_the_events(r, 1), {}, "mm before; where these were scanned", 1),
