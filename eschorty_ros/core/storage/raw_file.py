@@ -280,8 +280,8 @@ def write_events_raw(
     column: ArrayLike,
     row: ArrayLike,
     polarity: ArrayLike,
-    columns: int = 1280,
-    rows: int = 720,
+    columns: int,
+    rows: int,
 ) -> None:
     """Write ``events.raw`` at ``path`` from events of any camera.
 
@@ -308,8 +308,9 @@ def write_events_raw(
     --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     write_events_raw(f"{folder}/events.raw", [100, 230], [639, 640], [350, 351], [1, 0])
-    ...     sum(map(len, RawReader(f"{folder}/events.raw")))
+    ...     path = f"{folder}/events.raw"
+    ...     write_events_raw(path, [100, 230], [39, 40], [50, 51], [1, 0], columns=640, rows=480)
+    ...     sum(map(len, RawReader(path)))
     14
     """
     columns, rows = integer("columns", columns, 1, _SIZE_MAX), integer("rows", rows, 1, _SIZE_MAX)

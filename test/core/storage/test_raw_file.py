@@ -164,7 +164,7 @@ def test_events_of_another_camera_read_back_in_readout_order(tmp_path: Path) -> 
 def test_wrong_events_leave_the_file_as_it_is(tmp_path: Path, events, said: str) -> None:
     (tmp_path / "events.raw").write_text("the last good one")
     with pytest.raises(ArgumentError) as caught:
-        write_events_raw(tmp_path / "events.raw", *events)
+        write_events_raw(tmp_path / "events.raw", *events, columns=1280, rows=720)
     assert said in str(caught.value)
     assert (tmp_path / "events.raw").read_text() == "the last good one"
 
