@@ -28,7 +28,6 @@ _HEADER_MAX_BYTES = 64 * 1024
 _SIZE_MAX = 2048
 # A decoder takes the first time as less than what 24 bits hold.
 _BEGIN_MAX_US = (1 << 24) - 1
-_TIME_MAX_US = 1 << 60
 _EVENTS_AT_ONCE = 1 << 20
 _GZIP = b"\x1f\x8b"
 _VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
@@ -315,7 +314,7 @@ def write_events_raw(
     """
     columns, rows = integer("columns", columns, 1, _SIZE_MAX), integer("rows", rows, 1, _SIZE_MAX)
     events = EventArrays(
-        integer_vector("t_us", t_us, np.int64, 0, _TIME_MAX_US),
+        integer_vector("t_us", t_us, np.int64, 0, np.iinfo(np.int64).max),
         integer_vector("column", column, np.uint16, 0, columns - 1),
         integer_vector("row", row, np.uint16, 0, rows - 1),
         integer_vector("polarity", polarity, np.uint8, 0, 1),

@@ -155,6 +155,8 @@ def test_events_of_another_camera_read_back_in_readout_order(tmp_path: Path) -> 
         (([], [], [], []), "[0, 0, 0, 0] entries"),
         (([1, 2], [3, 4], [5, 6], [1]), "[2, 2, 2, 1] entries"),
         (([1 << 40], [3], [5], [1]), "t_us begins at 1099511627776; subtract that"),
+        (([1764512000 * 10**9], [3], [5], [1]), "t_us begins at 1764512000000000000; subtract"),
+        (([1, 1 << 61], [3, 4], [5, 6], [0, 1]), "t spans more than 2**40 us"),
         (([1, 1 << 33], [3, 4], [5, 6], [0, 1]), "stay within 3600000000 us"),
         (([0.5], [3], [5], [1]), "give one axis of integers"),
         (([1], [1280], [5], [1]), "column holds 1280; choose 0 to 1279"),
