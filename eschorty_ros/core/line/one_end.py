@@ -34,9 +34,9 @@ def _variance(now, widths):
 
 @kernel(_nrt=False)
 def _end_that_stays(now):
-    """Return which end of a profile's lines is in the same rows: 1 the last, -1 the first, else 0.
+    """Return which end of a profile's lines is in the same rows: 1 the last, -1 the first.
 
-    The other end follows the surface.
+    The other end follows the surface. 0 where it is not so.
     """
     row2, first2, last2 = _variance(now, 0.0), _variance(now, -PER_WIDTH), _variance(now, PER_WIDTH)
     if not (row2 > _ROW2_MIN and min(first2, last2) < _STAYS * row2):
@@ -57,7 +57,9 @@ def _restore_ends(rows, smoothing, now, end):
     returns, columns = rows.row.shape
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            lost_px = PER_WIDTH * max(widest_px - smoothing.width[k, c], 0.0)
-            smoothing.row[k, c] += end * lost_px
-            smoothing.sigma2[k, c] += lost_px * lost_px
             rows.mixed[k, c] = True
+            lost_px = PER_WIDTH * (widest_px - smoothing.width[k, c])
+            # A point without a width has none.
+            if lost_px > 0.0:
+                smoothing.row[k, c] += end * lost_px
+                smoothing.sigma2[k, c] += lost_px * lost_px

@@ -145,8 +145,8 @@ _STATE = (
     "full",  # 1 while a column needs more room
     "window",  # events since the estimate of the line started
     "profiles",  # since then
-    "one_end",  # profiles since then whose lines have lost one end
-    "known_one_end",  # 1 where most of the first window have
+    "one_end",  # profiles since then whose lines have one end in the same rows
+    "known_one_end",  # 1 where almost all of the first window have
     "over",  # 1 where a pass ended with the window
     "points",  # since the restart
     "points_most",  # the most of a profile
