@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,6 @@ from eschorty_ros.core.optics import SHIPPED
 if TYPE_CHECKING:
     from eschorty_ros.core.calibration import CalibrationReport, KnownTarget, Method, Targets
     from eschorty_ros.core.optics import Calibration
-    from eschorty_ros.core.storage import Recording
 
 # Targets side by side in a profile of a moving target when roll or smile is fitted.
 _BLOCKS = 8
@@ -129,7 +127,8 @@ def command(
 ) -> None:
     """Calibrate a build on targets at known ranges.
 
-    SOURCE is a CSV file of targets or a recording folder; several count together. Writes a
+    SOURCE is a CSV file of targets, a recording folder or, of posts, its events.raw alone; several
+    count together. Writes a
     calibration.yaml for --calibration of scan, simulate, reconstruct and convert, and a page with
     its uncertainty and verdicts. Where targets are refused nothing is written, and an existing file
     stays.
@@ -192,6 +191,7 @@ def command(
         recorded_moving_target,
     )
     from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.storage import load_recording
 
     design = load_calibration(nominal)
     # Roll and smile need several targets side by side.
@@ -199,17 +199,19 @@ def command(
     swept: set[bool] = set()
 
     def targets_of(source: Path) -> Targets:
-        if not source.is_dir():
+        if not _is_recorded(source):
             return read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
         if moving is None:
             return _posts(source, design, distances, range_sigma)
-        with _reading(source, design) as (recording, progress):
-            stage_mm = recording.stage_samples["position_mm"]
-            to_and_fro = 2.0 * abs(stage_mm[-1] - stage_mm[0]) < stage_mm.max() - stage_mm.min()
-            swept.update((True, False) if to_and_fro else (bool(stage_mm[-1] > stage_mm[0]),))
+        recording = load_recording(source)
+        _warn_of_another_build(source, recording.calibration, design)
+        stage_mm = recording.stage_samples["position_mm"]
+        to_and_fro = 2.0 * abs(stage_mm[-1] - stage_mm[0]) < stage_mm.max() - stage_mm.min()
+        swept.update((True, False) if to_and_fro else (bool(stage_mm[-1] > stage_mm[0]),))
+        with progress_bar("reading") as report:
             return recorded_moving_target(
                 recording, design, moving, range_per_stage=range_per_stage,
-                sigma_at_zero_mm=range_sigma, blocks=blocks, progress=progress,
+                sigma_at_zero_mm=range_sigma, blocks=blocks, progress=of_total(report),
             )  # fmt: skip
 
     targets = Targets.concatenate([targets_of(source) for source in sources])
@@ -233,17 +235,24 @@ def command(
 def _check_sources(sources: tuple[Path, ...], distances: str | None, moving: float | None) -> None:
     """Refuse options that have no effect on these sources, or are missing, as wrong usage."""
     refuse_given(["as_built"], "belongs to --fake")
-    if all(source.is_dir() for source in sources):
+    if all(map(_is_recorded, sources)):
         refuse_given(["row_sigma"], "is for a targets.csv")
     if moving is None:
         refuse_given(["range_per_stage"], "belongs to --moving")
     if not sources:
         raise click.UsageError("no SOURCE; give targets.csv, a recording, or --fake")
-    folders = [source for source in sources if source.is_dir()]
-    if not folders and (distances is not None or moving is not None):
-        raise click.UsageError("--distances and --moving belong to a recording folder")
-    if folders and (distances is None) == (moving is None):
-        raise click.UsageError(f"{folders[0]} is a recording; give --distances or --moving")
+    recorded = [source for source in sources if _is_recorded(source)]
+    if not recorded and (distances is not None or moving is not None):
+        raise click.UsageError("--distances and --moving belong to a recording")
+    if recorded and (distances is None) == (moving is None):
+        raise click.UsageError(f"{recorded[0]} is a recording; give --distances or --moving")
+    alone = [source for source in recorded if not source.is_dir()]
+    if alone and moving is not None:
+        raise click.UsageError(f"{alone[0]} has no stage; give --moving a recording folder")
+
+
+def _is_recorded(source: Path) -> bool:
+    return source.is_dir() or source.suffix.lower() == ".raw"
 
 
 def _check_out(out: Path) -> None:
@@ -266,30 +275,26 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
     return priors or None
 
 
-@contextlib.contextmanager
-def _reading(
-    source: Path, design: Calibration
-) -> Iterator[tuple[Recording, Callable[[int, int], None]]]:
-    """Give a recording and the report of what is read of it; warn where it is of another build."""
-    from eschorty_ros.core.storage import load_recording
-
-    recording = load_recording(source)
-    if recording.calibration.name != design.name:
+def _warn_of_another_build(source: Path, made: Calibration, design: Calibration) -> None:
+    if made.name != design.name:
         warn(
-            f"{source} is of the build {recording.calibration.name} and --nominal of "
-            f"{design.name}; give the design that made it"
+            f"{source} is of the build {made.name} and --nominal of {design.name}; give the "
+            "design that made it"
         )
-    with progress_bar("reading") as report:
-        yield recording, of_total(report)
 
 
 def _posts(source: Path, design: Calibration, distances: str | None, range_sigma: float) -> Targets:
-    """Return the posts that are found in a recording; print which are left out."""
+    """Return the posts that are found in events; print which are left out."""
     from eschorty_ros.core.calibration import recorded_posts
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.storage import CALIBRATION_FILE, EVENTS_FILE
 
     known = _known(distances, range_sigma)
-    with _reading(source, design) as (recording, progress):
-        match = recorded_posts(recording, known, design, progress)
+    events = source / EVENTS_FILE if source.is_dir() else source
+    if (source / CALIBRATION_FILE).is_file():
+        _warn_of_another_build(source, load_calibration(source / CALIBRATION_FILE), design)
+    with progress_bar("reading") as report:
+        match = recorded_posts(events, known, design, of_total(report))
     for line in match.rejected:
         click.echo(f"left out: {line}")
     if match.targets is None:

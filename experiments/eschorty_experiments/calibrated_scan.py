@@ -114,7 +114,7 @@ def _posts(effort: Effort, design: Calibration, built: Calibration) -> Targets:
     with TemporaryDirectory(prefix="eschorty_") as folder:
         travel_mm = (0.0, float(effort.choose(50, 15)))
         recording = _record(folder, scene, built, travel_mm, SPEED_MM_S, effort.seed)
-        match = recorded_posts(recording, known, design)
+        match = recorded_posts(recording.events_path, known, design)
     if match.targets is None:
         raise FitError("no post of the simulated scene was found; " + "; ".join(match.rejected))
     return match.targets

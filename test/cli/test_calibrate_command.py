@@ -1,6 +1,7 @@
 """`eschorty calibrate`: from targets and recordings to a file and a page."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,7 @@ from click.testing import CliRunner
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.calibration import DISTANCE_COLUMNS, PRIOR_SIGMA, TARGET_COLUMNS
-from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration, save_calibration
-from eschorty_ros.core.storage import write_laser_yaml, write_stage_csv
 from eschorty_ros.core.storage.raw_file import write_events_raw
 from eschorty_ros.simulation.scenes import Plane, Posts, bench
 from eschorty_ros.simulation.world import simulate_recording
@@ -103,6 +102,8 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
     before = rms_mm(NOMINAL, AS_BUILT)
     print(f"seed {SEED}: range RMS {after:.2f} mm, {before:.1f} mm before")
     assert after < 1.0 < 20.0 < before
+    alone = shutil.copy(tmp_path / "rec" / "events.raw", tmp_path / "posts.raw")
+    assert made_by(out, alone, *options[1:], distances) == made_by(out, *options, distances)
     sizes = tmp_path / "posts.csv"
     rows = [f"{post.range_mm},{post.size_mm}" for post in posts]
     sizes.write_text("\n".join(["range_mm,size_mm", *rows]))
@@ -115,9 +116,6 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
 def test_posts_that_fit_no_distances_and_events_of_another_sensor_are_one_line(tmp_path):
     folder = tmp_path / "posts"
     folder.mkdir()
-    save_calibration(NOMINAL, folder / "calibration.yaml")
-    write_laser_yaml(folder / "laser.yaml", Modulation(70.0))
-    write_stage_csv(folder / "stage.csv", [0, 10**6], [10.0, 20.0])
     rows = np.rint(AS_BUILT.model().row([900.0, 1200.0, 1500.0])).astype(int)
     # Three posts of 40 columns and 5 rows, 30 events in each pixel.
     column = np.add.outer(np.array([200, 600, 1000]), np.tile(np.arange(40), 150)).ravel()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.base.errors import FitError
@@ -21,14 +22,14 @@ _CHUNK_BYTES = 1 << 20
 
 
 def recorded_posts(
-    recording: Recording,
+    events_path: Path,
     known: Sequence[KnownTarget],
     nominal: Calibration,
     progress: Callable[[int, int], Any] | None = None,
 ) -> PostMatch:
-    """Find the posts in all events of a recording and match them to the known targets.
+    """Find the posts in all events of a RAW file and match them to the known targets.
 
-    - ``recording``: Of posts that keep their range: the stage still, or moving along them.
+    - ``events_path``: Of posts that keep their range: the stage still, or moving along them.
     - ``nominal``: The design of the build that made the recording.
     - ``progress``: Called with bytes read so far and bytes in all.
 
@@ -36,12 +37,11 @@ def recorded_posts(
     ``FitError`` when no post is found, or the posts agree with the ranges in more than one way.
     Raises ``FormatError`` when the event file is not EVT3.
     """
-    made, reader = recording.calibration, RawReader(recording.events_path)
-    refuse_other_sensor(str(recording.path), made.columns, made.rows, nominal)
-    refuse_other_sensor(str(recording.events_path), *reader.header.named_size, nominal)
+    reader = RawReader(events_path)
+    refuse_other_sensor(str(events_path), *reader.header.named_size, nominal)
     frame = AggregateFrame(nominal.columns, nominal.rows)
     decoder = Decoder(nominal.columns, nominal.rows)
-    total, done = recording.events_path.stat().st_size, 0
+    total, done = events_path.stat().st_size, 0
     for chunk in reader.chunks(_CHUNK_BYTES):
         frame.add(decoder.decode(chunk))
         done += len(chunk)
@@ -50,7 +50,7 @@ def recorded_posts(
     posts = find_posts(frame)
     if not posts:
         raise FitError(
-            f"{recording.path}: no post found in {frame.events} events; check laser, focus and "
+            f"{events_path}: no post found in {frame.events} events; check laser, focus and "
             "that the posts cross the sheet"
         )
     return match_posts(posts, known, nominal.model())
@@ -68,7 +68,8 @@ def recorded_moving_target(
 ) -> Targets:
     """Return a target for every profile of a flat target that the stage moves along the range.
 
-    - ``recording``, ``nominal``, ``progress``: As in `recorded_posts`.
+    - ``recording``: Of the target while the stage moves.
+    - ``nominal``, ``progress``: As in `recorded_posts`.
     - ``range_at_zero_mm``, ``range_per_stage``, ``sigma_at_zero_mm``, ``blocks``: As in
       `moving_target`, which also lists the errors.
     """
