@@ -50,6 +50,17 @@ def bench(instrument):
     return instrument[0]
 
 
+@pytest.fixture
+def restarted(instrument):
+    """Start the reconstruction and the scanner again where a test has failed after their end."""
+    yield
+    for module in (RECONSTRUCTION, SCANNER):
+        processes, name = instrument[1], node_name(module)
+        if not processes[name].running():
+            processes[name].kill()
+            processes[name] = started(module, instrument)
+
+
 def test_full_scan(bench):
     scenarios.full_scan(bench)
 
@@ -131,6 +142,7 @@ def test_a_burst_of_goals_leaves_nothing_behind(bench):
     assert canceled.result().status == GoalStatus.STATUS_CANCELED
 
 
+@pytest.mark.usefixtures("restarted")
 def test_killed_reconstruction_ends_the_scan_at_once(instrument, tmp_path):
     """The reconstruction dies mid-scan: light off at once, reason and recording are named."""
     bench, running, _ = instrument
@@ -156,6 +168,7 @@ def test_killed_reconstruction_ends_the_scan_at_once(instrument, tmp_path):
     scenarios.full_scan(bench)
 
 
+@pytest.mark.usefixtures("restarted")
 def test_killed_scanner_leaves_the_points_so_far(instrument):
     """The scanner dies mid-scan: the reconstruction publishes the points so far."""
     bench, running, _ = instrument
@@ -172,6 +185,7 @@ def test_killed_scanner_leaves_the_points_so_far(instrument):
     running["scanner"] = started(SCANNER, instrument)
 
 
+@pytest.mark.usefixtures("restarted")
 def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scans(instrument):
     """The scanner ends mid-scan: without its heartbeat the laser switches off."""
     bench, running, _ = instrument
