@@ -128,10 +128,9 @@ def command(
     """Calibrate a build on targets at known ranges.
 
     SOURCE is a CSV file of targets, a recording folder or, of posts, its events.raw alone; several
-    count together. Writes a
-    calibration.yaml for --calibration of scan, simulate, reconstruct and convert, and a page with
-    its uncertainty and verdicts. Where targets are refused nothing is written, and an existing file
-    stays.
+    count together. Writes a calibration.yaml for --calibration of scan, simulate, reconstruct and
+    convert, and a page with its uncertainty and verdicts. Where targets are refused nothing is
+    written, and an existing file stays.
 
     \b
     targets.csv   row,range_mm[,row_sigma][,range_sigma_mm][,column]
@@ -287,10 +286,10 @@ def _posts(source: Path, design: Calibration, distances: str | None, range_sigma
     """Return the posts that are found in events; print which are left out."""
     from eschorty_ros.core.calibration import recorded_posts
     from eschorty_ros.core.optics import load_calibration
-    from eschorty_ros.core.storage import CALIBRATION_FILE, EVENTS_FILE
+    from eschorty_ros.core.storage.recording import CALIBRATION_FILE, recorded_events
 
     known = _known(distances, range_sigma)
-    events = source / EVENTS_FILE if source.is_dir() else source
+    events = recorded_events(source) if source.is_dir() else source
     if (source / CALIBRATION_FILE).is_file():
         _warn_of_another_build(source, load_calibration(source / CALIBRATION_FILE), design)
     with progress_bar("reading") as report:

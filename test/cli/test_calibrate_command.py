@@ -116,6 +116,9 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
 def test_posts_that_fit_no_distances_and_events_of_another_sensor_are_one_line(tmp_path):
     folder = tmp_path / "posts"
     folder.mkdir()
+    done = run(folder, "--distances", "900,1200,1500", "--out", tmp_path / "made.yaml")
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert "missing from the recording is events.raw" in done.stderr
     rows = np.rint(AS_BUILT.model().row([900.0, 1200.0, 1500.0])).astype(int)
     # Three posts of 40 columns and 5 rows, 30 events in each pixel.
     column = np.add.outer(np.array([200, 600, 1000]), np.tile(np.arange(40), 150)).ravel()
@@ -221,7 +224,9 @@ def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
 
 def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
     (tmp_path / "rec").mkdir()
+    (tmp_path / "posts.raw").touch()
     for arguments, message in (
+        ((tmp_path / "posts.raw", "--moving", 5), "posts.raw has no stage"),
         ((targets_csv, "--distances", "1,2"), "belong to a recording"),
         ((targets_csv, "--prior", "b_mm"), "NAME=SIGMA"),
         ((targets_csv, "--prior", "b_mm=much"), "NAME=SIGMA"),

@@ -239,6 +239,15 @@ def load_recording(
     return recording.corrected(calibration, frequency_hz)
 
 
+def recorded_events(folder: Path) -> Path:
+    """Return the RAW file of a recording folder whose other files may be missing.
+
+    Raises ``FormatError`` when there is none.
+    """
+    _check_files(folder, _NEEDED.keys() - {EVENTS_FILE})
+    return folder / EVENTS_FILE
+
+
 def _check_files(folder: Path, replaced: set[str]) -> None:
     """Refuse a folder that lacks files, all of them named; those ``replaced`` may be missing."""
     missing = []
