@@ -119,6 +119,7 @@ def match_posts(
 def _refuse_upside_down(
     posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
 ) -> None:
+    """Refuse posts that agree with the known ranges when the image is turned by 180 degrees."""
     turned = [
         replace(post, row=nominal.rows - 1 - post.row, column=nominal.columns - 1 - post.column)
         for post in posts

@@ -765,14 +765,20 @@ def _lost_in_row_order(events: Events, slot_us: int, share: float) -> Events:
     return tuple(values[order[rank < capacity]] for values in events)
 
 
+def _before_and_late(found, error, late) -> tuple[float, float, float]:
+    """Return the median error of early and of late profiles, and the share of these in 2 sigma."""
+    before_px, after_px = np.median(error[~late]), np.median(error[late])
+    covered = np.mean(error[late] < 2.0 * found.sigma_row[late])
+    print(f"error {before_px:.2f}, then {after_px:.2f} px, {covered:.2f} within 2 sigma")
+    return before_px, after_px, covered
+
+
 @pytest.mark.parametrize("slot_us", [1, 10])
 def test_rows_of_a_readout_that_loses_one_side_of_the_line_are_those_of_late_events(slot_us):
     camera = Camera(periods=60)
     found, reconstructor = points(camera, _lost_in_row_order(camera.line(wavy), slot_us, 0.5))
     error, late = np.abs(error_px(found)), found.period > 16
-    before_px, after_px = np.median(error[~late]), np.median(error[late])
-    covered = np.mean(error[late] < 2.0 * found.sigma_row[late])
-    print(f"error {before_px:.2f}, then {after_px:.2f} px, {covered:.2f} within 2 sigma")
+    before_px, after_px, covered = _before_and_late(found, error, late)
     assert before_px > 1.0, f"seed {camera.seed}"
     assert after_px < 0.5 * before_px
     # 0.35 and 0.36 where rows of early and late events are not compared.
@@ -798,12 +804,10 @@ def test_lines_that_a_readout_ends_at_one_row_are_restored_and_flagged_with_a_wa
     found, reconstructor = points(camera, tuple(values[kept] for values in events))
     error = np.abs(found.row - waves(found.period, found.column))
     late = found.period >= 16
-    before_px, after_px = np.median(error[~late]), np.median(error[late])
-    covered = np.mean(error[late] < 2.0 * found.sigma_row[late])
-    print(f"error {before_px:.2f}, then {after_px:.2f} px, {covered:.2f} within 2 sigma")
+    before_px, after_px, covered = _before_and_late(found, error, late)
     assert before_px > 1.5, f"seed {camera.seed}"
     assert after_px < 0.4 * before_px
-    # 0.25 where rows are not moved.
+    # 0.31 and 0.19 where rows are not moved.
     assert covered > 0.75
     assert np.all(found.flags[late] & MIXED > 0)
     (warning,) = reconstructor.warnings
