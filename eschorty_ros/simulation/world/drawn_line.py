@@ -17,6 +17,9 @@ from eschorty_ros.simulation.world.off_sheet import off_sheet
 
 _ROW_STEP = 0.02
 _REFLECTANCE_STEP = 0.01
+_THICKNESS_STEP = 0.01
+_SIGMA_MIN_ROWS = 0.5
+"""Where a surface slopes towards the camera, its line is as thin as the lens images a point."""
 
 
 class _Patches(NamedTuple):
@@ -24,6 +27,7 @@ class _Patches(NamedTuple):
 
     row: Array
     reflectance: Array
+    sigma_rows: Array
     low_row: Array
     high_row: Array
 
@@ -44,6 +48,7 @@ class DrawnLine:
         self._level = 0.0
         self._row = np.full(model.columns, np.nan)
         self._reflectance = np.full(model.columns, np.nan)
+        self._thickness = np.ones(model.columns)
         self._was_split = np.zeros(model.columns, dtype=bool)
 
     def redraw(self) -> None:
@@ -73,43 +78,66 @@ class DrawnLine:
         moved &= ~(np.isnan(seen.row) & np.isnan(self._row))
         with np.errstate(invalid="ignore"):
             moved |= np.abs(seen.reflectance - self._reflectance) > _REFLECTANCE_STEP
+            moved |= np.abs(seen.thickness - self._thickness) > _THICKNESS_STEP * seen.thickness
         moved |= self._was_split | (self._effects.ghost > 0.0)
         moved[seen.split] = False
         if moved.any():
             columns = self._every_column[moved]
-            row, reflectance = seen.row[moved, np.newaxis], seen.reflectance[moved, np.newaxis]
+            row, reflectance, thickness = (
+                values[moved, np.newaxis] for values in (seen.row, seen.reflectance, seen.thickness)
+            )
             whole = np.full_like(row, np.inf)
-            self._place(t_us, position_mm, columns, _Patches(row, reflectance, -whole, whole))
-            self._row[moved] = seen.row[moved]
-            self._reflectance[moved] = seen.reflectance[moved]
+            parts = _Patches(row, reflectance, self._sigma_rows(thickness), -whole, whole)
+            self._place(t_us, position_mm, columns, parts)
+            for drawn, values in (
+                (self._row, seen.row),
+                (self._reflectance, seen.reflectance),
+                (self._thickness, seen.thickness),
+            ):
+                drawn[moved] = values[moved]
         self._was_split[:] = False
         if seen.split.size:
             self._was_split[seen.split] = True
-            parts = (seen.patch_row, seen.patch_reflectance, seen.low_row, seen.high_row)
-            self._place(t_us, position_mm, seen.split, _Patches(*parts))
+            sigma = self._sigma_rows(seen.patch_thickness)
+            split = (seen.patch_row, seen.patch_reflectance, sigma, seen.low_row, seen.high_row)
+            self._place(t_us, position_mm, seen.split, _Patches(*split))
+
+    def _sigma_rows(self, thickness: Array) -> Array:
+        return np.maximum(self._pixels.parameters.sigma_rows * thickness, _SIGMA_MIN_ROWS)
 
     def _place(
         self, t_us: int, position_mm: float, columns: NDArray[np.int64], patches: _Patches
     ) -> None:
         """Place patches on the pixels, out of focus and beside a ghost where there are these."""
-        effects, sharp = self._effects, self._pixels.parameters.sigma_rows
+        effects, model = self._effects, self._model
         each = columns[:, np.newaxis]
-        sigma = np.full_like(patches.row, sharp)
         if effects.defocus_mm:
-            range_mm = self._model.range_mm(patches.row, each)
-            blur = off_sheet(self._calibration, range_mm, each, effects.defocus_mm).blur_rows
-            sigma = np.hypot(sharp, blur)
+            range_mm = model.range_mm(patches.row, each)
+            off = off_sheet(self._calibration, range_mm, each, effects.defocus_mm)
+            patches = _blurred(patches, off.blur_rows)
         if effects.ghost:
             there_mm = np.array([position_mm + effects.ghost_mm])
-            range_mm = self._scene.range_mm(there_mm, columns, self._model).T
+            range_mm = self._scene.range_mm(there_mm, columns, model).T
             ghost = off_sheet(self._calibration, range_mm, each, effects.ghost_mm)
-            light = effects.ghost * self._scene.reflectance(there_mm, columns, self._model).T
+            light = effects.ghost * self._scene.reflectance(there_mm, columns, model).T
             whole = np.full_like(light, np.inf)
-            added = _Patches(ghost.row, light, -whole, whole)
-            patches = _Patches(*map(np.hstack, zip(patches, added, strict=True)))
-            sigma = np.hstack((sigma, np.hypot(sharp, ghost.blur_rows)))
-        # A blurred line has the same light on more rows.
-        reflectance = patches.reflectance * self._level * (sharp / sigma)
+            across = np.full_like(light, self._pixels.parameters.sigma_rows)
+            added = _Patches(ghost.row, light, across, -whole, whole)
+            pairs = zip(patches, _blurred(added, ghost.blur_rows), strict=True)
+            patches = _Patches(*map(np.hstack, pairs))
         self._pixels.relight(
-            t_us, columns, patches.row, reflectance, patches.low_row, patches.high_row, sigma
+            t_us,
+            columns,
+            patches.row,
+            patches.reflectance * self._level,
+            patches.low_row,
+            patches.high_row,
+            patches.sigma_rows,
         )
+
+
+def _blurred(patches: _Patches, blur_rows: Array) -> _Patches:
+    """Return patches out of focus, with the same light on more rows."""
+    sigma = np.hypot(patches.sigma_rows, blur_rows)
+    reflectance = patches.reflectance * (patches.sigma_rows / sigma)
+    return patches._replace(reflectance=reflectance, sigma_rows=sigma)

@@ -29,10 +29,13 @@ class LineOnScene:
     reflectance: Array
     """Row of the middle of the line and reflectance there, shape (columns,); NaN where it hits
     nothing."""
+    thickness: Array
+    """Rows of the line's thickness over those on a surface across the sheet, shape (columns,)."""
     split: NDArray[np.int64]
     """Columns in which an edge is within the thickness of the line, shape (n,)."""
     patch_row: Array
     patch_reflectance: Array
+    patch_thickness: Array
     low_row: Array
     high_row: Array
     """The two patches of each of these columns, shape (n, 2), arguments of
@@ -45,8 +48,9 @@ def line_on_scene(
     """Return the line on the scene across its thickness.
 
     Rows ``d`` above the line's centre image the scene ``d / rows_per_mm_off_sheet`` behind the
-    sheet. Only a jump of range or reflectance makes a second patch; for a smooth surface the range
-    in the middle of the line is used.
+    sheet. Only a jump of range or reflectance makes a second patch; a smooth surface has the range
+    and the slope in the middle of the line. Where it slopes by ``s`` rows per mm, the line is
+    ``|1 - s / rows_per_mm_off_sheet|`` times as thick.
 
     - ``half_rows``: Rows from the line's centre to where it fades.
     """
@@ -79,8 +83,16 @@ def line_on_scene(
     patch_row = np.column_stack((here_row, there_row))
     with np.errstate(invalid="ignore"):
         per_mm = model.rows_per_mm_off_sheet(model.range_mm(patch_row, split[:, np.newaxis]))
-    border = patch_row - edge_mm[:, np.newaxis] * per_mm
     ahead = (edge_mm > 0.0)[:, np.newaxis]
+    first, last = np.full((2, model.columns), [[_CENTRE - 1], [_CENTRE + 1]])
+    # Beside an edge the slope is that of the other side.
+    first[split[edge_mm < 0.0]], last[split[edge_mm > 0.0]] = _CENTRE, _CENTRE
+    slope = (row[last, columns] - row[first, columns]) / (stages[last] - stages[first])
+    with np.errstate(invalid="ignore"):
+        narrowed = slope / model.rows_per_mm_off_sheet(range_mm[_CENTRE])
+    # Beside nothing the slope is unknown.
+    thickness = np.abs(1.0 - np.nan_to_num(narrowed))
+    border = patch_row - edge_mm[:, np.newaxis] * per_mm
     middle = np.array([True, False])
     # The surface ahead of the edge (+y) is below it on the sensor.
     below = ahead != middle
@@ -89,9 +101,11 @@ def line_on_scene(
     return LineOnScene(
         row=row[_CENTRE],
         reflectance=reflectance[_CENTRE],
+        thickness=thickness,
         split=split,
         patch_row=patch_row,
         patch_reflectance=np.where(dark, 0.0, patch_reflectance),
+        patch_thickness=np.column_stack((thickness[split], np.ones(split.size))),
         low_row=np.where(below | dark, -np.inf, border),
         high_row=np.where(below & ~dark, border, np.inf),
     )

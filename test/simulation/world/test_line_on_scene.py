@@ -11,6 +11,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.simulation.scenes import Plane, Sphere, named
 from eschorty_ros.simulation.world import World, line_on_scene
+from eschorty_ros.simulation.world.off_sheet import off_sheet
 
 SEED = 2
 CALIBRATION = replace(load_calibration("config_3"), columns=48, principal_column=None)
@@ -71,6 +72,20 @@ def test_smooth_surfaces_have_one_patch() -> None:
             assert np.array_equal(seen.row, MODEL.row(here))
     over_the_top = line_on_scene(Sphere(1320.0, 50.0), MODEL, 50.0, HALF_ROWS)
     assert over_the_top.split.size == 0
+
+
+@pytest.mark.parametrize("slope", [-2.0, 0.5, 3.0])
+def test_a_slope_along_the_stage_narrows_or_widens_the_line(slope: float) -> None:
+    """A beam's ray beside the sheet meets the slope elsewhere: both move its image."""
+    scene, beside_mm = Plane(1320.0, slope), 0.1
+    seen = line_on_scene(scene, MODEL, 0.0, HALF_ROWS)
+    across = off_sheet(CALIBRATION, np.array([1320.0]), np.array([24]), beside_mm).row
+    on_slope = off_sheet(
+        CALIBRATION, np.array([1320.0 + slope * beside_mm]), np.array([24]), beside_mm
+    ).row
+    middle = float(MODEL.row(1320.0, 24))
+    expected = np.abs((on_slope - middle) / (across - middle))
+    assert seen.thickness == pytest.approx(np.full(48, expected), rel=0.01)
 
 
 def test_the_end_of_a_scene_cuts_the_line() -> None:
