@@ -52,7 +52,8 @@ def test_sweeps_forth_and_back_give_the_geometry(sweeps):
     assert rms_mm(both) < 0.2
     # A line that moves over the pixels is seen late: half of the difference of the directions.
     assert rms_mm(both) < 0.5 * min(rms_mm(forth), rms_mm(back))
-    assert 0.5 < pulls.std() < 1.5
+    # On this slope the line is thinner, and the rows nearer, than on a target that moves.
+    assert 0.4 < pulls.std() < 1.5
 
 
 def test_blocks_lie_side_by_side(sweeps):

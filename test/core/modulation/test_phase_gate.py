@@ -242,7 +242,7 @@ def test_a_learned_gate_does_not_move_a_line_that_moves_while_it_is_lit(tmp_path
     ("scene", "columns", "pixels", "speed_mm_s", "travel_mm", "most_mm"),
     [
         # These columns have all of its first lines, which are an ear.
-        (named("face"), 640, "paper", 100.0, (0.0, 200.0), 0.127),
+        (named("face"), 640, "paper", 100.0, (0.0, 200.0), 0.172),
         (Plane(1100.0, slope_stage=1.2, pivot_mm=40.0), 1280, "noisy", 300.0, (10.0, 70.0), 0.273),
     ],
     ids=["the first lines are few and weak", "the stage is at rest at first"],
