@@ -6,8 +6,9 @@ when few lines of the stream have it for longer than a profile: the width of a l
 crosses changes, that on a dark surface stays. Where stripes or many edges make all widths usual,
 one that changes is compared with the last that was steady, or else with the mode of all. An edge
 leaves one end of the line where it is: where the row does not move with the width, the light has
-changed. Row and width change together from column to column, too, where an edge is oblique, and
-over many profiles where it is slow.
+changed. A width that changes evenly for longer than an edge takes is that of a curved surface. Row
+and width change together from column to column, too, where an edge is oblique, and over many
+profiles where it is slow.
 
 The lens spreads light over near columns. At an edge that crosses the line, columns have light of
 both sides: their row is between those beside them, and their line is wider than either. Where a
@@ -34,6 +35,12 @@ from eschorty_ros.core.line.line_history import (
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART
 from eschorty_ros.core.line.smoothing import WIDTH_COLUMNS, WIDTH_PAIRS
+from eschorty_ros.core.line.width_trend import (
+    WidthTrend,
+    _follow_widths,
+    _restart_trend,
+    empty_trend,
+)
 
 # Widths that are separated, per row and in all.
 _PER_ROW = 16
@@ -95,10 +102,11 @@ class Widths(NamedTuple):
     steady_row: NDArray[np.float64]
     recent: NDArray[np.float64]
     recent_row: NDArray[np.float64]
+    trend: WidthTrend
 
 
-def empty_widths(shape: tuple[int, int]) -> Widths:
-    """Return no widths of profiles of a ``shape``."""
+def empty_widths(shape: tuple[int, int], rows: int) -> Widths:
+    """Return no widths of profiles of a ``shape``, on a sensor of ``rows``."""
     return Widths(
         usual=empty_usual_widths(shape[1]),
         below=np.zeros(_BINS + 1),
@@ -111,6 +119,7 @@ def empty_widths(shape: tuple[int, int]) -> Widths:
         steady_row=np.full(shape, np.nan),
         recent=np.full(shape, np.nan),
         recent_row=np.full(shape, np.nan),
+        trend=empty_trend(shape[1], rows),
     )
 
 
@@ -198,6 +207,7 @@ def _restart_widths(widths, known):
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
     widths.recent[:], widths.recent_row[:] = np.nan, np.nan
     widths.below[:] = 0.0
+    _restart_trend(widths.trend)
     _update(widths, widths.last.shape[1])
 
 
@@ -309,6 +319,8 @@ def _follow_line(rows, smoothing, widths, history, lit_share, windowed):
     returns, columns = row.shape
     known = _is_known(widths)
     usual = typical.median if known else np.inf
+    sigma = _SIGMA_PER_MEDIAN * typical.difference
+    _follow_widths(row[0], widths.last_row[0], smoothing.width[0], sigma, widths.trend)
     for k in range(returns):
         _without_motion(
             smoothing.width[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
@@ -332,7 +344,6 @@ def _follow_line(rows, smoothing, widths, history, lit_share, windowed):
         now.sigma2[block], now.points[block] = sigma2, points
         now.moved[block], now.in_both[block] = moved, in_both
     if windowed:
-        sigma = _SIGMA_PER_MEDIAN * typical.difference
         _compare_with_recent(history, known, typical.median, WIDTH_COLUMNS * sigma * sigma)
 
 
@@ -404,8 +415,11 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     """Return the variance of a row near an edge that passes its block of columns, px squared.
 
     ``passing2`` is that of the block. The row's line has, within its scatter, the usual and its
-    steady width.
+    steady width. One whose width changes evenly is off by the change of its full width in two
+    profiles at most: it changes while it is lit, and pixels remember the line before.
     """
+    if k == 0 and widths.trend.even[c]:
+        passing2 = min(passing2, (2.0 * ROOT_12 * widths.trend.change[c]) ** 2)
     if passing2 == 0.0:
         return 0.0
     width, steady = widths.static_width[k, c], widths.steady[k, c]
@@ -427,16 +441,17 @@ def _edge_and_weight(rows, smoothing, widths, k, c, sigma, reach, moves):
     slow2 = _slow_edge_variance(widths, k, c, smoothing.row[k, c], sigma, moves)
     if not known:
         return edge2, 1.0
-    edge2 = max(edge2, slow2)
+    even = k == 0 and widths.trend.even[c]
+    edge2 = 0.0 if even else max(edge2, slow2)
     edge2 = max(edge2, _mixed_variance(rows, smoothing, k, c, np.sqrt(WIDTH_COLUMNS) * sigma))
     edge2 = max(edge2, _oblique_variance(smoothing, widths, k, c, sigma))
     if _is_usual(widths.below, width, reach):
         return edge2, 1.0
     weight = _MOVING_WEIGHT if moves else _MIXED_WEIGHT
-    even, mode = widths.usual.scale[c] * width, widths.usual.typical.mode
-    if _is_usual(widths.below, even, reach):
+    scaled, mode = widths.usual.scale[c] * width, widths.usual.typical.mode
+    if even or _is_usual(widths.below, scaled, reach):
         return edge2, weight
-    return max(edge2, min(_unusual_variance(width, mode), _unusual_variance(even, mode))), weight
+    return max(edge2, min(_unusual_variance(width, mode), _unusual_variance(scaled, mode))), weight
 
 
 @kernel(_nrt=False)

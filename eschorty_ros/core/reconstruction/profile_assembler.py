@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.boxed import Boxed
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
@@ -88,6 +89,9 @@ class ProfileAssembler:
             raise ArgumentError(
                 f"rows is {model.rows}; the reconstruction supports {ROW_LAST + 1} at most"
             )
+        self._model = model
+        self._speed_mm_s = settings.stage_speed_mm_s
+        self._profile_us = 0.0
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
         self._window_rows = settings.line_width_px
@@ -137,6 +141,8 @@ class ProfileAssembler:
                 light=lit,
             )
         )
+        self._profile_us = every * modulation.period_us
+        self.set_stage_speed(self._speed_mm_s)
         self._state["status"] = CLOSED
         self._memory.columns.counts[:] = 0
         known = self._memory.known.state
@@ -168,6 +174,7 @@ class ProfileAssembler:
         )
         for name in ("known_half", "known_one_end"):
             self._state[name] = before._memory.state[name]
+        self._memory.widths.trend.crossing[:] = memory.widths.trend.crossing
         self._memory.columns.counts[:] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["status"] = CLOSED
@@ -175,6 +182,12 @@ class ProfileAssembler:
         self._state["status"] = EMPTY
         self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
         self._state["period"] = edges.period[edge]
+
+    def set_stage_speed(self, mm_s: float) -> None:
+        """Set the stage's speed from now on; 0 where it is not known."""
+        self._speed_mm_s = mm_s
+        step_mm = abs(mm_s) * self._profile_us * 1e-6
+        self._memory.widths.trend.crossing[:] = _profiles_per_px(self._model, step_mm)
 
     @property
     def window_is_over(self) -> bool:
@@ -270,6 +283,21 @@ class ProfileAssembler:
             self._done.append(
                 LineRows(**{name: values[:n].copy() for name, values in output.items()})
             )
+
+
+def _profiles_per_px(model: RangeModel, step_mm: float) -> Array:
+    """Return by row the profiles in which an edge crosses a px of the line; 0 if not known.
+
+    The stage moves by ``step_mm`` from profile to profile.
+    """
+    try:
+        rows_per_mm = model.rows_per_mm_off_sheet(model.range_mm(np.arange(model.rows)))
+    except ArgumentError:
+        # The build has no lens at which a point beside the sheet has an image.
+        return np.zeros(model.rows)
+    rows_per_profile = step_mm * rows_per_mm
+    known = np.isfinite(rows_per_profile) & (rows_per_profile > 0.0)
+    return np.divide(1.0, rows_per_profile, out=np.zeros(model.rows), where=known)
 
 
 @kernel

@@ -238,7 +238,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
             settings.isolation_events,
             shape,
         ),
-        widths=empty_widths(shape),
+        widths=empty_widths(shape, model.rows),
         two_lines=empty_two_lines(),
         history=empty_history(model.columns),
         light=Light(),

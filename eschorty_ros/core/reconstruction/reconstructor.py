@@ -373,6 +373,17 @@ class Reconstructor:
         if modulation != self.modulation:
             self._restart(modulation)
 
+    def set_stage_speed(self, mm_s: float) -> None:
+        """Set the stage's speed towards +y, mm/s, from now on; 0 where it is not known."""
+        if mm_s == self.settings.stage_speed_mm_s:
+            return
+        self.settings = replace(self.settings, stage_speed_mm_s=mm_s)
+        self._assembler.set_stage_speed(mm_s)
+        if self._compensator is not None:
+            self._counts["columns_compensated"] += self._compensator.columns_compensated
+            self._before_restart.append(self._with_ranges(self._compensator.flush()))
+            self._compensator = None
+
     def restart_phase(self) -> None:
         """Estimate the phase again from the next data on: the laser has been switched on.
 

@@ -81,6 +81,11 @@ class WindowAssembler:
         """Drop the open period; see `ProfileAssembler.restart`."""
         self._open.restart(modulation, every, edge_us, first)
 
+    def set_stage_speed(self, mm_s: float) -> None:
+        """Set the stage's speed from now on; 0 where it is not known."""
+        for assembler in (self._open, *self._idle):
+            assembler.set_stage_speed(mm_s)
+
     @property
     def has_begun(self) -> bool:
         """Return whether a period is open."""
