@@ -230,6 +230,12 @@ class PacketStream:
             self._epoch = None
         self._zero_ended = False
 
+    def set_stage_speed(self, mm_s: float) -> None:
+        """Set the stage's speed towards +y for packets processed later."""
+        self._settings = replace(self._settings, stage_speed_mm_s=mm_s)
+        if self._reconstructor is not None:
+            self._reconstructor.set_stage_speed(mm_s)
+
     def end_recording(self) -> None:
         """Record no more packets."""
         self._recorder = None

@@ -298,8 +298,11 @@ class Pipeline:
         stop_mm: float,
         recorder: ScanRecorder | None = None,
         passes: int = 1,
+        speed_mm_s: float = 0.0,
     ) -> None:
         """Start collecting, and recording; a repeated request, after a lost answer, does nothing.
+
+        A ``speed_mm_s`` of 0 leaves that of the settings.
 
         Raises ``ArgumentError`` when another scan is being collected already, or for bad limits.
         """
@@ -312,6 +315,8 @@ class Pipeline:
             )
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
+        if speed_mm_s:
+            self.stream.set_stage_speed(math.copysign(speed_mm_s, stop_mm - start_mm))
         # What still waits for a stage position is of before the scan.
         since_ns = self.stream.processed_until_ns
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm, since_ns)

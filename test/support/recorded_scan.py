@@ -30,6 +30,7 @@ BEGIN_US, LASER_US = 30_000, 50_000
 SETTINGS = Settings(smoothing_half_width=3, trigger_source="none")
 PACKET_BYTES = 1500
 LIMITS_MM = 11.0, 19.0
+SPEED_MM_S = 50.0
 
 
 def source(folder):
@@ -44,7 +45,8 @@ class LiveScan:
     """Packets with late stamps, seq from 7 on; those of ``lost`` are missing."""
 
     def __init__(self, recording, folder, lost=(), settings=SETTINGS, **options):
-        log = ScanLog(scan_id="s", start_mm=LIMITS_MM[0], stop_mm=LIMITS_MM[1], stage_gap_s=0.5)
+        limits = dict(zip(("start_mm", "stop_mm"), LIMITS_MM, strict=True))
+        log = ScanLog(scan_id="s", **limits, speed_mm_s=SPEED_MM_S, stage_gap_s=0.5)
         build = recording.calibration
         self.recorder = ScanRecorder(folder, log, build, asdict(settings), **options)
         assert self.recorder.made(5.0) == ""
@@ -83,7 +85,7 @@ class LiveScan:
             if not begun and t_us > BEGIN_US:
                 begun = True
                 pipeline.process(now_s)
-                pipeline.begin_scan("s", *LIMITS_MM, self.recorder)
+                pipeline.begin_scan("s", *LIMITS_MM, self.recorder, speed_mm_s=SPEED_MM_S)
             while states and t_us > states[0][0]:
                 since_us, modulation, on = states.pop(0)
                 pipeline.process(now_s)

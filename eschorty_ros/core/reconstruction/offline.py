@@ -309,10 +309,14 @@ def _push(
 
 
 def stage_speed_mm_s(recording: Recording) -> float:
-    """Return the stage's median speed while it cruises; 0 when it rests or has gaps alone.
+    """Return the speed of a recorded scan, or else the stage's median speed while it cruises.
 
-    Positive where the first pass is towards +y. Raises ``FormatError`` for more than 10 m/s.
+    It is 0 when the stage rests or has gaps alone, and positive where the first pass is towards +y.
+    Raises ``FormatError`` for more than 10 m/s.
     """
+    scan = recording.scan
+    if scan is not None and scan.speed_mm_s:
+        return math.copysign(scan.speed_mm_s, scan.stop_mm - scan.start_mm)
     first_us, last_us = recording.stage.first_us, recording.stage.last_us
     if first_us is None or last_us is None or last_us == first_us:
         return 0.0

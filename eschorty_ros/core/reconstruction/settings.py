@@ -146,9 +146,9 @@ class Settings:
         "off", SWITCH, "correct the shift of points at reflectance steps"
     )
     stage_speed_mm_s: float = _number(
-        300.0, -10_000.0, 10_000.0, "mm/s",
-        "stage speed towards +y, from which the compensation follows a step through the "
-        "line, 0 for a resting one; a recording's own speed is used instead",
+        0.0, -10_000.0, 10_000.0, "mm/s",
+        "stage speed towards +y, which says how long an edge takes to cross the line; 0 where it "
+        "is not known; that of a scan or recording is used instead",
     )  # fmt: skip
     organized: str = _choice(
         "off", SWITCH, "the cloud of a scan as a height map of profiles and columns, NaN where "

@@ -85,7 +85,7 @@ class ScanLog(Schema):
     ``state`` is ``recording`` while it is written, and stays so when the process is killed.
     ``packets_lost`` did not arrive, ``packets_left_out`` arrived and were not written, for the
     ``reason``. A gap of the stage's samples longer than ``stage_gap_s`` is not bridged; 0 bridges
-    any.
+    any. A ``speed_mm_s`` of 0 is not known.
     """
 
     KIND = "log of a scan"
@@ -94,6 +94,7 @@ class ScanLog(Schema):
     start_mm: float
     stop_mm: float
     passes: Annotated[int, Within(1)] = 1
+    speed_mm_s: Annotated[float, Within(0.0, 1e4)] = 0.0
     stage_gap_s: Annotated[float, Within(0.0, 1e9)] = 0.0
     state: Literal["recording", "ended"] = "recording"
     packets_lost: Annotated[int, Within(0)] = 0

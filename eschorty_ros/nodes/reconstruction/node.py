@@ -285,7 +285,7 @@ class ReconstructionNode(Node):
         self._outputs.scan(scan, self.parameters["organized"] == "on")
 
     def _recorder(
-        self, scan_id: str, start_mm: float, stop_mm: float, passes: int
+        self, scan_id: str, start_mm: float, stop_mm: float, passes: int, speed_mm_s: float
     ) -> ScanRecorder | None:
         """Return a recorder of a scan, ``None`` unless the parameter ``record`` is set."""
         values = self.parameters
@@ -300,6 +300,7 @@ class ReconstructionNode(Node):
             start_mm=start_mm,
             stop_mm=stop_mm,
             passes=passes,
+            speed_mm_s=speed_mm_s,
             stage_gap_s=float(values["stage_gap"]),
         )
         settings = dataclasses.asdict(settings_of(values, Settings))

@@ -64,7 +64,7 @@ class ScanServices:
         running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan], None],
-        recorder: Callable[[str, float, float, int], ScanRecorder | None],
+        recorder: Callable[[str, float, float, int, float], ScanRecorder | None],
     ) -> None:
         self._node, self._pipeline, self._fault = node, pipeline, fault
         self._in_worker, self._running = in_worker, running
@@ -131,12 +131,15 @@ class ScanServices:
             response.success, response.recording = True, self._folder
             return response
         limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
-        recorder = self._make_recorder(scan_id, *limits_mm, passes)
+        speed_mm_s = mm_from_m(request.speed)
+        recorder = self._make_recorder(scan_id, *limits_mm, passes, speed_mm_s)
         if recorder is not None:
             response.message = recorder.made(_RECORD_S)
         if response.message:
             return response
-        begin = partial(self._pipeline.begin_scan, scan_id, *limits_mm, recorder, passes)
+        begin = partial(
+            self._pipeline.begin_scan, scan_id, *limits_mm, recorder, passes, speed_mm_s
+        )
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         if response.success:
             self._recorder = recorder

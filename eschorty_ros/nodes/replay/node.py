@@ -23,7 +23,7 @@ from sensor_msgs.msg import TimeReference
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.clocks import NS_PER_US
-from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.reconstruction import Settings, stage_speed_mm_s
 from eschorty_ros.core.storage import Recording, load_recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.live.bag_files import is_bag
@@ -190,6 +190,7 @@ class ReplayNode(Node):
                 start=m_from_mm(start_mm),
                 stop=m_from_mm(stop_mm),
                 passes=1 if scan is None else scan.passes,
+                speed=m_from_mm(abs(stage_speed_mm_s(self._recording))),
             ),
             again=True,
         )

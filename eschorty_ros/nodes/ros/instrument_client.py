@@ -382,6 +382,7 @@ class ScanClient(InstrumentClient):
             start=m_from_mm(request.start_mm),
             stop=m_from_mm(request.stop_mm),
             passes=request.passes,
+            speed=m_from_mm(request.speed_mm_s),
         )
         self.monitor.restart_samples(self._now_ns())
         ends_s, refusal = time.monotonic() + _DEAD_S, ""

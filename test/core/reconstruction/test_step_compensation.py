@@ -20,6 +20,7 @@ from eschorty_ros.core.reconstruction import (
     stage_speed_mm_s,
 )
 from eschorty_ros.core.reconstruction.step_compensation import _centroid_shift
+from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.simulation.pixels import PixelParameters
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
@@ -227,12 +228,15 @@ def test_the_speed_of_a_stage_that_goes_forth_and_back_is_that_of_one_pass():
     stage = StageTrack()
     t_us = np.arange(0, 2_200_001, 10_000)
     stage.append(t_us, np.interp(t_us, [0, 1_000_000, 1_100_000, 2_100_000], [10, 60, 60, 10]))
-    recording = SimpleNamespace(stage=stage, calibration=load_calibration("config_3"))
+    recording = SimpleNamespace(stage=stage, scan=None, calibration=load_calibration("config_3"))
     assert stage_speed_mm_s(recording) == pytest.approx(50.0, rel=0.01)
+    # That of a scan is the one that its live points were made with.
+    recording.scan = ScanLog(scan_id="s", start_mm=60.0, stop_mm=10.0, speed_mm_s=49.0)
+    assert stage_speed_mm_s(recording) == -49.0
 
 
 def test_a_stage_with_gaps_alone_has_no_speed():
     stage = StageTrack(max_gap_us=1_000_000)
     stage.append(np.array([0, 10_000_000]), np.array([10.0, 60.0]))
-    recording = SimpleNamespace(stage=stage, calibration=load_calibration("config_3"))
+    recording = SimpleNamespace(stage=stage, scan=None, calibration=load_calibration("config_3"))
     assert stage_speed_mm_s(recording) == 0.0
