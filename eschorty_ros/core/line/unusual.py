@@ -415,17 +415,17 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     """Return the variance of a row near an edge that passes its block of columns, px squared.
 
     ``passing2`` is that of the block. The row's line has, within its scatter, the usual and its
-    steady width. One whose width changes evenly is off by the change of its full width in two
-    profiles at most: it changes while it is lit, and pixels remember the line before.
+    steady width. Of a width that changes evenly what it changes by in two profiles counts: it
+    changes while the line is lit, and pixels remember the line before.
     """
-    if k == 0 and widths.trend.even[c]:
-        passing2 = min(passing2, (2.0 * ROOT_12 * widths.trend.change[c]) ** 2)
     if passing2 == 0.0:
         return 0.0
     width, steady = widths.static_width[k, c], widths.steady[k, c]
     apart = abs(width - widths.usual.typical.median)
     if not np.isnan(steady):
         apart = max(apart, abs(width - steady))
+    if k == 0 and widths.trend.even[c]:
+        apart = min(apart, 2.0 * abs(widths.trend.change[c]))
     return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
 
 

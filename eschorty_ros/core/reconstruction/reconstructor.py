@@ -468,6 +468,11 @@ class Reconstructor:
                 f"no modulation at {self.modulation.frequency_hz:g} Hz found in the events; none "
                 "of them is used"
             )
+        if self.settings.reflectance_compensation == "on" and not self.settings.stage_speed_mm_s:
+            found.append(
+                "reflectance_compensation is on, but the stage rests or its speed is not known; "
+                "set stage_speed_mm_s"
+            )
         faults = stream_faults(counts)
         found += faults
         if not is_unreadable(counts):

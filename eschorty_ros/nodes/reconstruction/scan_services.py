@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
-from eschorty_ros.core.base.errors import one_line
+from eschorty_ros.core.base.errors import ArgumentError, one_line
 from eschorty_ros.core.base.files import bare_name_fault
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
@@ -132,7 +132,11 @@ class ScanServices:
             return response
         limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
         speed_mm_s = mm_from_m(request.speed)
-        recorder = self._make_recorder(scan_id, *limits_mm, passes, speed_mm_s)
+        recorder = None
+        try:
+            recorder = self._make_recorder(scan_id, *limits_mm, passes, speed_mm_s)
+        except ArgumentError as error:
+            response.message = one_line(str(error))
         if recorder is not None:
             response.message = recorder.made(_RECORD_S)
         if response.message:

@@ -120,6 +120,15 @@ def test_a_resting_stage_has_no_steps_to_compensate():
     assert counts["columns_compensated"] == 0
 
 
+def test_a_compensation_without_a_speed_is_a_warning():
+    made = Reconstructor(
+        load_calibration("config_3"), Modulation(70.0), Settings(reflectance_compensation="on")
+    )
+    assert "set stage_speed_mm_s" in "\n".join(made.warnings)
+    made.set_stage_speed(50.0)
+    assert "set stage_speed_mm_s" not in "\n".join(made.warnings)
+
+
 @pytest.mark.parametrize("bend", [{"b_prime_1_px": 8.0}, {"b_prime_2_px": -8.0}], ids=str)
 def test_a_compensated_row_becomes_a_range_in_its_own_column(bend):
     case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=40, slanted=True, seed=SEED)

@@ -17,7 +17,7 @@ from tf2_msgs.msg import TFMessage
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.reconstruction import reconstruct_recording, stage_speed_mm_s
 from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
@@ -65,7 +65,8 @@ def publish(driver: Driver, observer: Observer, recording, states) -> None:
     # Before the scan begins: a sweep shorter than the scan is reported as incomplete.
     stamp = message.header.stamp
     wait_until(lambda: placed and placed[-1].transforms[-1].header.stamp == stamp, "the stage")
-    request = BeginScan.Request(scan_id="driver", start=0.0, stop=0.22)
+    speed = 1e-3 * abs(stage_speed_mm_s(recording))
+    request = BeginScan.Request(scan_id="driver", start=0.0, stop=0.22, speed=speed)
     answer = observer.call(BeginScan, "reconstruction/begin_scan", request)
     assert answer.success, answer.message
     sent_ns = []

@@ -59,8 +59,8 @@ def renamed(tmp_path):
         yield observer, events, odometry
 
 
-def begin(observer, scan_id, stop=0.1):
-    request = BeginScan.Request(scan_id=scan_id, stop=stop)
+def begin(observer, scan_id, stop=0.1, speed=0.0):
+    request = BeginScan.Request(scan_id=scan_id, stop=stop, speed=speed)
     return observer.call(BeginScan, "reconstruction/begin_scan", request)
 
 
@@ -94,6 +94,7 @@ def test_a_refused_request_that_was_corrected_begins_its_scan(devices):
     observer, _, odometry = devices
     odometry.publish(sample(observer))
     assert "is not finite" in begin(observer, "corrected", math.inf).message
+    assert "speed_mm_s is -50.0" in begin(observer, "corrected", speed=-0.05).message
     answer = begin(observer, "corrected")
     assert answer.success, answer.message
     end(observer, "corrected")
