@@ -415,8 +415,7 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     """Return the variance of a row near an edge that passes its block of columns, px squared.
 
     ``passing2`` is that of the block. The row's line has, within its scatter, the usual and its
-    steady width. Of a width that changes evenly what it changes by in two profiles counts: it
-    changes while the line is lit, and pixels remember the line before.
+    steady width.
     """
     if passing2 == 0.0:
         return 0.0
@@ -424,8 +423,6 @@ def _passing_variance(widths, passing2, k, c, sigma_width):
     apart = abs(width - widths.usual.typical.median)
     if not np.isnan(steady):
         apart = max(apart, abs(width - steady))
-    if k == 0 and widths.trend.even[c]:
-        apart = min(apart, 2.0 * abs(widths.trend.change[c]))
     return min(passing2, PER_WIDTH**2 * (apart * apart + sigma_width * sigma_width))
 
 
