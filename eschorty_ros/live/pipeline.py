@@ -34,7 +34,6 @@ from eschorty_ros.live.sweep_coverage import COMPLETE, SweepCoverage
 
 # Packets wait for the camera's clock and for the worker; a recording begins with one of these.
 _STAGE_BEFORE_US = 10_000_000
-_SPEED_MAX_MM_S = 10_000.0
 # Profiles over those that there can be, as a factor and a number, that the ends explain.
 _SURPLUS, _ENDS = 1.05, 3
 
@@ -317,7 +316,7 @@ class Pipeline:
             )
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
-        if number("speed_mm_s", speed_mm_s, 0.0, _SPEED_MAX_MM_S):
+        if number("speed_mm_s", speed_mm_s, 0.0):
             self.stream.set_stage_speed(math.copysign(speed_mm_s, stop_mm - start_mm))
         # What still waits for a stage position is of before the scan.
         since_ns = self.stream.processed_until_ns

@@ -45,8 +45,10 @@ class LiveScan:
     """Packets with late stamps, seq from 7 on; those of ``lost`` are missing."""
 
     def __init__(self, recording, folder, lost=(), settings=SETTINGS, **options):
-        limits = dict(zip(("start_mm", "stop_mm"), LIMITS_MM, strict=True))
-        log = ScanLog(scan_id="s", **limits, speed_mm_s=SPEED_MM_S, stage_gap_s=0.5)
+        start_mm, stop_mm = LIMITS_MM
+        log = ScanLog(
+            scan_id="s", start_mm=start_mm, stop_mm=stop_mm, speed_mm_s=SPEED_MM_S, stage_gap_s=0.5
+        )
         build = recording.calibration
         self.recorder = ScanRecorder(folder, log, build, asdict(settings), **options)
         assert self.recorder.made(5.0) == ""

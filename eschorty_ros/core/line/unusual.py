@@ -35,12 +35,7 @@ from eschorty_ros.core.line.line_history import (
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART
 from eschorty_ros.core.line.smoothing import WIDTH_COLUMNS, WIDTH_PAIRS
-from eschorty_ros.core.line.width_trend import (
-    WidthTrend,
-    _follow_widths,
-    _restart_trend,
-    empty_trend,
-)
+from eschorty_ros.core.line.width_trend import WidthTrend, _follow_widths, empty_trend
 
 # Widths that are separated, per row and in all.
 _PER_ROW = 16
@@ -207,7 +202,6 @@ def _restart_widths(widths, known):
     widths.steady[:], widths.steady_row[:] = np.nan, np.nan
     widths.recent[:], widths.recent_row[:] = np.nan, np.nan
     widths.below[:] = 0.0
-    _restart_trend(widths.trend)
     _update(widths, widths.last.shape[1])
 
 

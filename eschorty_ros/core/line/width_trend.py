@@ -41,12 +41,6 @@ def empty_trend(columns: int, rows: int) -> WidthTrend:
     return WidthTrend(width, change, profiles, np.zeros(columns, dtype=np.bool_), np.zeros(rows))
 
 
-@kernel
-def _restart_trend(trend):
-    """Clear what the widths of earlier profiles have shown."""
-    trend.profiles[:], trend.even[:] = 0.0, False
-
-
 @kernel(_nrt=False)
 def _follow_widths(row, last_row, width, sigma, trend):
     """Continue the trend with the ``width`` of each column, px, whose deviation is ``sigma``.
@@ -57,13 +51,12 @@ def _follow_widths(row, last_row, width, sigma, trend):
     for c in range(np.uintp(row.size)):
         trend.even[c] = False
         if np.isnan(row[c]):
-            trend.profiles[c] = 0.0
             continue
         crossing = trend.crossing[min(max(np.int64(row[c]), 0), last)]
         if crossing == 0.0:
             continue
         if not abs(row[c] - last_row[c]) < width[c]:
-            # Another surface.
+            # Another surface, or none before.
             trend.profiles[c], trend.width[c], trend.change[c] = 0.0, width[c], 0.0
         profiles, end = trend.profiles[c] + 1.0, trend.width[c] + trend.change[c]
         off = width[c] - end
