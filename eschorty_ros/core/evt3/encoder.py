@@ -10,6 +10,7 @@ from eschorty_ros.core.base.arrays import integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
 from eschorty_ros.core.base.numbers import integer
+from eschorty_ros.core.base.sort_keys import sort_keys
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3.events import EventArrays, _first_fall
 
@@ -213,7 +214,7 @@ def sort_readout(
         raise ArgumentError("t spans more than 2**40 us; sort shorter pieces")
     key = (times - origin) << 23 | rows.astype(np.int64) << 12
     key |= polarities.astype(np.int64) << 11 | columns
-    key.sort()
+    sort_keys(key)
     return EventArrays(
         (key >> 23) + origin,
         (key & 0x7FF).astype(np.uint16),

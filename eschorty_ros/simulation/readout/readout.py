@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import entry_kernel, kernel, record
+from eschorty_ros.core.base.sort_keys import sort_keys
 
 DROP_NOTE_US = 1000
 """Least time between two reports of the sensor that its readout drops events."""
@@ -167,7 +168,7 @@ class Readout:
         _read_out(requests, until_us, self._state, self._queue, out)
         n = int(out.counts["keys"])
         keys = out.keys[:n]
-        keys.sort()
+        sort_keys(keys)
         # np.unique hashes and is ten times slower here.
         fresh = np.append(True, keys[1:] != keys[:-1])[:n]
         if not fresh.all():
