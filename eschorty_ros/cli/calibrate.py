@@ -202,8 +202,8 @@ def command(
             return read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
         if moving is None:
             return _posts(source, design, distances, range_sigma)
-        recording = load_recording(source)
-        _warn_of_another_build(source, recording.calibration, design)
+        _warn_of_another_build(source, design)
+        recording = load_recording(source, design)
         stage_mm = recording.stage_samples["position_mm"]
         to_and_fro = 2.0 * abs(stage_mm[-1] - stage_mm[0]) < stage_mm.max() - stage_mm.min()
         swept.update((True, False) if to_and_fro else (bool(stage_mm[-1] > stage_mm[0]),))
@@ -274,7 +274,13 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
     return priors or None
 
 
-def _warn_of_another_build(source: Path, made: Calibration, design: Calibration) -> None:
+def _warn_of_another_build(source: Path, design: Calibration) -> None:
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.storage.recording import CALIBRATION_FILE
+
+    if not (source / CALIBRATION_FILE).is_file():
+        return
+    made = load_calibration(source / CALIBRATION_FILE)
     if made.name != design.name:
         warn(
             f"{source} is of the build {made.name} and --nominal of {design.name}; give the "
@@ -285,13 +291,11 @@ def _warn_of_another_build(source: Path, made: Calibration, design: Calibration)
 def _posts(source: Path, design: Calibration, distances: str | None, range_sigma: float) -> Targets:
     """Return the posts that are found in events; print which are left out."""
     from eschorty_ros.core.calibration import recorded_posts
-    from eschorty_ros.core.optics import load_calibration
-    from eschorty_ros.core.storage.recording import CALIBRATION_FILE, recorded_events
+    from eschorty_ros.core.storage.recording import recorded_events
 
     known = _known(distances, range_sigma)
     events = recorded_events(source) if source.is_dir() else source
-    if (source / CALIBRATION_FILE).is_file():
-        _warn_of_another_build(source, load_calibration(source / CALIBRATION_FILE), design)
+    _warn_of_another_build(source, design)
     with progress_bar("reading") as report:
         match = recorded_posts(events, known, design, of_total(report))
     for line in match.rejected:
