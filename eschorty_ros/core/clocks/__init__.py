@@ -11,6 +11,7 @@ from eschorty_ros.core.clocks.sensor_clock import SensorClock
 from eschorty_ros.core.clocks.stage_track import (
     NM_PER_MM,
     POSITION_LIMIT_MM,
+    SPEED_LIMIT_MM_S,
     StageTrack,
     quantise_nm,
 )
@@ -19,6 +20,7 @@ __all__ = [
     "NM_PER_MM",
     "NS_PER_US",
     "POSITION_LIMIT_MM",
+    "SPEED_LIMIT_MM_S",
     "ClockLine",
     "EdgeClock",
     "LowerEnvelope",

@@ -12,6 +12,7 @@ from eschorty_ros.core.base.numbers import TIME_LIMIT, integer
 
 NM_PER_MM = 1_000_000
 POSITION_LIMIT_MM = 1e9
+SPEED_LIMIT_MM_S = 1e4
 
 
 def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:

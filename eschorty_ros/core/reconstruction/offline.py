@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.clocks import SPEED_LIMIT_MM_S
 from eschorty_ros.core.optics import refuse_other_sensor
 from eschorty_ros.core.reconstruction.clock_wraps import in_wrap
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
@@ -37,7 +38,6 @@ _WINDOWS_BYTES = 1 << 27
 _WAITING = 4
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
-_SPEED_MAX_MM_S = 10_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,7 +312,7 @@ def stage_speed_mm_s(recording: Recording) -> float:
     """Return the speed of a recorded scan, or else the stage's median speed while it cruises.
 
     It is 0 when the stage rests or has gaps alone, and positive where the first pass is towards +y.
-    Raises ``FormatError`` for more than 10 m/s.
+    Raises ``FormatError`` for more than ``SPEED_LIMIT_MM_S``.
     """
     scan = recording.scan
     if scan is not None and scan.speed_mm_s:
@@ -333,7 +333,7 @@ def stage_speed_mm_s(recording: Recording) -> float:
     if not cruising.size:
         return 0.0
     along_mm_s = math.copysign(float(np.median(np.abs(cruising))), cruising[0])
-    if abs(along_mm_s) > _SPEED_MAX_MM_S:
+    if abs(along_mm_s) > SPEED_LIMIT_MM_S:
         raise FormatError(
             f"{recording.path / STAGE_FILE}: the stage moves at {abs(along_mm_s) * 1e-3:.3g} m/s; "
             "write t_us in microseconds and position_mm in millimetres"

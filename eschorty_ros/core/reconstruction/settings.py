@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.clocks import SPEED_LIMIT_MM_S
 from eschorty_ros.core.line import CENTROIDS, RETURNS, SIGMA_FLOOR_PX, check_method
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US
@@ -146,7 +147,7 @@ class Settings:
         "off", SWITCH, "correct the shift of points at reflectance steps"
     )
     stage_speed_mm_s: float = _number(
-        0.0, -10_000.0, 10_000.0, "mm/s",
+        0.0, -SPEED_LIMIT_MM_S, SPEED_LIMIT_MM_S, "mm/s",
         "stage speed towards +y, which says how long an edge takes to cross the line; 0 where it "
         "is not known; that of a scan or recording is used instead",
     )  # fmt: skip

@@ -24,7 +24,13 @@ from eschorty_ros.core.base.files import atomic_write, open_regular_file
 from eschorty_ros.core.base.numbers import file_path, short
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import read_yaml, write_yaml
-from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
+from eschorty_ros.core.clocks import (
+    NM_PER_MM,
+    POSITION_LIMIT_MM,
+    SPEED_LIMIT_MM_S,
+    StageTrack,
+    quantise_nm,
+)
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, load_calibration
 
@@ -94,7 +100,7 @@ class ScanLog(Schema):
     start_mm: float
     stop_mm: float
     passes: Annotated[int, Within(1)] = 1
-    speed_mm_s: Annotated[float, Within(0.0, 1e4)] = 0.0
+    speed_mm_s: Annotated[float, Within(0.0, SPEED_LIMIT_MM_S)] = 0.0
     stage_gap_s: Annotated[float, Within(0.0, 1e9)] = 0.0
     state: Literal["recording", "ended"] = "recording"
     packets_lost: Annotated[int, Within(0)] = 0
