@@ -47,7 +47,7 @@ NOT_RUN = {
     "sudo", "export", "for", "do", "done", "colcon", "source", ".", "python3", "cmp",
     "EVENTS=qos_overrides./eschorty/camera/events",
 }  # fmt: skip
-SHORT = {"simulate": {"stop": 18.0}}
+SHORT = {"simulate": {"stop_mm": 18.0}}
 # The end of two long sweeps, which only --moving reads.
 NEARER = {"810": "60"}
 
