@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,14 @@ from typing import Any
 from command_process import CommandProcess, run_commands
 from short_folder import short_folder
 
+from eschorty_ros.emulation.bench import devices
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench.server import serving
 from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
+from eschorty_ros.simulation.scenes import Steps, named
+
+NARROW_STEPS = Steps(column_levels_mm=(*[math.nan] * 3, 25.0, 60.0, *[math.nan] * 3))
+"""``steps`` of a remote bench: two of its eight column bands, as a bench costs what is lit."""
 
 
 @contextlib.contextmanager
@@ -35,6 +41,7 @@ def remote_bench(**settings: Any) -> Iterator[tuple[CommandProcess, Path]]:
 
 def serve(folder: str, settings: str) -> None:
     raise_priority(DEVICE_NICE)
+    devices.named = lambda name, model: NARROW_STEPS if name == "steps" else named(name, model)
     bench = Bench(BenchSettings(**json.loads(settings)))
     with serving(bench, Path(folder)):
         run_commands(bench.set_scene)

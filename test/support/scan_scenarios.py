@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
+from benches import NARROW_STEPS
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
@@ -22,7 +23,6 @@ from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.report.accuracy import lit_columns, range_error_mm
-from eschorty_ros.simulation.scenes import Steps
 
 EVENTS = "qos_overrides./eschorty/camera/events"
 SCENE = "steps"
@@ -35,7 +35,7 @@ BUT_ONE = 0.98 - 1.0 / PERIODS
 SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
 """Of sweeps that are interrupted: few events, and interrupted far from their end."""
 SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
-SWEPT_POINTS = 40_000
+SWEPT_POINTS = 10_000
 # The feedback also counts points outside start to stop, as many as the stage's begin takes on a
 # busy computer.
 KEPT_POINTS = SWEPT_POINTS // 4
@@ -215,7 +215,7 @@ def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: 
     The errors are those of points whose beam, 7 mm along the stage, lies on one level: the number
     of other points depends on where the scan ends.
     """
-    model, scene = load_calibration(CALIBRATION).model(), Steps()
+    model, scene = load_calibration(CALIBRATION).model(), NARROW_STEPS
     error_mm = range_error_mm(points, scene, model)
     known = np.isfinite(error_mm)
     share = np.count_nonzero(known) / int(lit_columns(scene, model, positions_mm).sum())
