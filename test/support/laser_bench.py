@@ -32,8 +32,8 @@ class LaserBench:
         self.awg = stack.enter_context(awg_process(folder))
         # No report of the contact that a loaded machine delays may end the light.
         defaults = {"driver": "awg", "backend": self.awg.backend, "interlock_timeout": 60.0}
-        parameters = {**defaults, **parameters}
-        self.node = self.start(module, parameters)
+        self._node = module, {**defaults, **parameters}
+        self.node = self.start(*self._node)
         self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
         self.contact = Contact(observer)
 
@@ -43,6 +43,12 @@ class LaserBench:
         self._stack.enter_context(process)
         self._stack.callback(lambda: print(f"--- {process.module}\n{process.output}"))
         return process
+
+    def restart(self) -> None:
+        """End the laser node, if it runs, and start another one."""
+        self.node.kill()
+        self.node = self.start(*self._node)
+        self.observer.wait_for_state("laser", "active")
 
     def arm(self) -> Any:
         return self.observer.call(Trigger, "laser/arm")
