@@ -41,11 +41,11 @@ def devices():
         yield observer, events, odometry
 
 
-@pytest.fixture
-def renamed(tmp_path):
+@pytest.fixture(scope="module")
+def renamed(tmp_path_factory):
     """As ``devices``, for another camera driver's topic, with recordings, the first one named."""
-    topic = "/event_camera/events"
-    parameters = {"frequency": 70.0, "record": os.path.relpath(tmp_path), "record_name": "a"}
+    topic, folder = "/event_camera/events", tmp_path_factory.mktemp("recordings")
+    parameters = {"frequency": 70.0, "record": os.path.relpath(folder), "record_name": "a"}
     with (
         Observer() as observer,
         NodeProcess(
@@ -56,7 +56,7 @@ def renamed(tmp_path):
     ):
         events = observer.publisher(EventPacket, topic, qos.events())
         odometry = observer.publisher(Odometry, "stage/odom", qos.stream())
-        yield observer, events, odometry
+        yield observer, events, odometry, folder
 
 
 def begin(observer, scan_id, stop=0.1, speed=0.0):
@@ -115,18 +115,19 @@ def test_a_second_publisher_is_refused_and_may_be_one_that_was_killed(devices):
 
 
 def test_a_second_publisher_of_another_topic_may_be_one_that_was_killed(renamed):
-    observer, events, odometry = renamed
+    observer, events, odometry, _ = renamed
     odometry.publish(sample(observer))
-    observer.node.create_publisher(EventPacket, events.topic_name, qos.events())
+    second = observer.node.create_publisher(EventPacket, events.topic_name, qos.events())
     answer = begin(observer, "two")
+    observer.node.destroy_publisher(second)
     assert "/event_camera/events has 2 publishers" in answer.message
     assert answer.retry
 
 
-def test_a_refused_scan_leaves_no_folder_and_its_name_to_the_next(renamed, tmp_path):
-    observer, _, odometry = renamed
+def test_a_refused_scan_leaves_no_folder_and_its_name_to_the_next(renamed):
+    observer, _, odometry, folder = renamed
     odometry.publish(sample(observer))
-    used = tmp_path / "a" / "cloud.pcd"
+    used = folder / "a" / "cloud.pcd"
     used.parent.mkdir()
     used.touch()
     assert "is not empty" in begin(observer, "refused").message
@@ -134,12 +135,12 @@ def test_a_refused_scan_leaves_no_folder_and_its_name_to_the_next(renamed, tmp_p
     answer = begin(observer, "good")
     assert answer.success, answer.message
     assert "'good' is being collected" in begin(observer, "another").message
-    wait_until(lambda: [path.name for path in tmp_path.iterdir()] == ["a"], "its folder alone")
+    wait_until(lambda: [path.name for path in folder.iterdir()] == ["a"], "its folder alone")
     end(observer, "good")
     answer = begin(observer, "next")
     assert answer.success, answer.message
-    wait_until(lambda: [path.name for path in tmp_path.iterdir()] == ["next"], "its folder alone")
-    assert end(observer, "next").recording == str(tmp_path / "next")
+    wait_until(lambda: [path.name for path in folder.iterdir()] == ["next"], "its folder alone")
+    assert end(observer, "next").recording == str(folder / "next")
 
 
 def test_packets_of_another_encoding_are_named_after_a_scan_and_in_the_diagnostics(devices):
