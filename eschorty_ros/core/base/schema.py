@@ -136,7 +136,8 @@ def _hints(schema: Any) -> dict[str, Any]:
 
 def _near(schema: Any, key: str) -> list[str]:
     """Return the schema's key that is most like ``key``, if one is like it."""
-    return get_close_matches(key, _hints(schema), n=1)
+    hints = _hints(schema)
+    return [key] if key in hints else get_close_matches(key, hints, n=1)
 
 
 def _record(schema: Any, data: dict[str, Any], keys: Keys, faults: list[Fault]) -> Any:
