@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,8 @@ class DrawnLine:
         self._model = model = calibration.model()
         self._pixels = pixels
         self._effects = effects
+        # A stage at rest leaves it as it is, from period to period.
+        self._on_scene = lru_cache(maxsize=1)(partial(line_on_scene, scene, model))
         self._every_column = np.arange(model.columns)
         self._position_mm = np.nan
         self._level = 0.0
@@ -73,7 +76,7 @@ class DrawnLine:
 
     def _draw_at(self, t_us: int, position_mm: float) -> None:
         half_rows = self._pixels.parameters.half_width_rows
-        seen = line_on_scene(self._scene, self._model, position_mm, half_rows)
+        seen = self._on_scene(position_mm, half_rows)
         moved = ~(np.abs(seen.row - self._row) <= _ROW_STEP)
         moved &= ~(np.isnan(seen.row) & np.isnan(self._row))
         with np.errstate(invalid="ignore"):

@@ -41,12 +41,13 @@ class Visible:
         """Return a mask of the columns whose hit at this stage step the camera does not see."""
         if step not in self._hidden:
             along_mm, beside_mm = self._model.pupil_mm
+            nearest_mm, _ = self._model.range_limits_mm
             hit = self._surface(step)
             hidden = np.zeros(hit.size, dtype=bool)
             farthest = np.fmax.reduce(hit, initial=0.0)
             ray, behind = hit, 0
             # Until the ray is nearer than any point that the sensor images.
-            while farthest > self._model.range_limits_mm[0]:
+            while farthest > nearest_mm:
                 behind += 1
                 share = behind * _STEP_MM / beside_mm
                 ray = hit - (hit - along_mm) * share
