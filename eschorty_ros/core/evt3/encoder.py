@@ -212,15 +212,17 @@ def sort_readout(
     origin = times.min()
     if int(times.max()) - int(origin) >= 1 << 40:
         raise ArgumentError("t spans more than 2**40 us; sort shorter pieces")
-    key = (times - origin) << 23 | rows.astype(np.int64) << 12
-    key |= polarities.astype(np.int64) << 11 | columns
+    key = times - origin
+    for values, bits in ((rows, 11), (polarities, 1), (columns, 11)):
+        key <<= bits
+        key |= values
     sort_keys(key)
-    return EventArrays(
-        (key >> 23) + origin,
-        (key & 0x7FF).astype(np.uint16),
-        (key >> 12 & 0x7FF).astype(np.uint16),
-        (key >> 11 & 1).astype(np.uint8),
-    )
+    columns = key.astype(np.uint16) & 0x7FF
+    polarities = (key >> 11).astype(np.uint8) & 1
+    rows = (key >> 12).astype(np.uint16) & 0x7FF
+    key >>= 23
+    key += origin
+    return EventArrays(key, columns, rows, polarities)
 
 
 _STREAM = typeof(record(*_STATE))
