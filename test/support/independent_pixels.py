@@ -70,36 +70,38 @@ class Camera:
         column = np.arange(COLUMNS)
         power = np.broadcast_to(power, column.shape)
         reach = max(REACH, round(2.4 * self.half_width_px))
-        offset = np.arange(-reach, reach + 1)
+        offset = np.arange(-reach, reach + 1)[:, None]
         parts: list[Events] = []
         for k in range(self.periods):
             true_row = np.broadcast_to(np.asarray(row(k, column), float), column.shape)
-            lit = np.isfinite(true_row)
-            y = np.rint(np.where(lit, true_row, 0.0)).astype(int)[None, :] + offset[:, None]
-            x = np.broadcast_to(column, y.shape)
-            seen = lit & (y >= 0) & (y < ROWS)
-            y, x, centre = y[seen], x[seen], np.broadcast_to(true_row, y.shape)[seen]
+            (lit,) = np.nonzero(np.isfinite(true_row))
+            y = np.rint(true_row[lit]).astype(int) + offset
+            y, x, away = np.broadcast_arrays(y, lit, y - true_row[lit])
+            seen = (y >= 0) & (y < ROWS)
+            y, x, away = y[seen], x[seen], away[seen]
             low, high = part(k, x)
-            inside = (y - centre >= low) & (y - centre < high)
-            brighter = self.contrast * power[x] * self.light(y - centre) * inside
+            # Beyond that is less light than passes any pixel's threshold.
+            near = np.abs(away) < 2.4 * self.half_width_px
+            (lit,) = np.nonzero(near & (away >= low) & (away < high))
+            brighter = self.contrast * power[x[lit]] * self.light(away[lit])
             swing = np.log1p(brighter)
-            # Less light passes no pixel's threshold.
             able = swing > 0.25 * self.threshold
-            y, x, brighter, swing = y[able], x[able], brighter[able], swing[able]
+            lit, brighter, swing = lit[able], brighter[able], swing[able]
+            y, x = y[lit], x[lit]
+            first_us = self.delay_us * (1.0 + 2.0 / np.maximum(brighter, 0.2))
             for polarity in (1, 0):
-                wanted = swing * (1.0 + 0.05 * self.rng.standard_normal(able.size)[able])
-                count = np.floor(wanted / self.thresholds[1 - polarity, y, x]).astype(int)
-                count = np.clip(count, 0, self.events_max)
-                nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-                late = self.delay_us * (1.0 + 2.0 / np.repeat(np.maximum(brighter, 0.2), count))
-                late = late * (1.0 + 0.6 * nth) + self.jitter_us * np.abs(
-                    self.rng.standard_normal(nth.size)
-                )
+                noise = self.rng.standard_normal(seen.sum())[lit]
+                wanted = swing * (1.0 + 0.05 * noise)
+                count = (wanted / self.thresholds[1 - polarity, y, x]).astype(int)
+                count = np.minimum(count, self.events_max)
+                of = np.repeat(np.arange(count.size), count)
+                nth = np.arange(of.size) - (np.cumsum(count) - count)[of]
+                late = first_us[of] * (1.0 + 0.6 * nth)
+                late += self.jitter_us * np.abs(self.rng.standard_normal(nth.size))
                 start = FIRST_EDGE_US + (k + (0.0 if polarity else self.duty)) * self.period_us
                 t = np.rint(start + late).astype(np.int64)
                 which = np.full(t.size, polarity, np.uint8)
-                at = (np.repeat(values.astype(np.uint16), count) for values in (x, y))
-                parts.append((t, *at, which))
+                parts.append((t, x[of].astype(np.uint16), y[of].astype(np.uint16), which))
         return joined(parts)
 
     def moving_line(self, row: Callable[[int, NDArray[Any]], NDArray[Any]], way_px: int) -> Events:
@@ -193,11 +195,7 @@ def joined(parts: list[Events]) -> Events:
 
 def stream(*parts: Events) -> bytes:
     """Return the EVT3 bytes of all events in the order of the sensor's readout."""
-    t, x, y, p = joined(list(parts))
-    events = sort_readout(
-        t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8)
-    )
-    return Encoder().encode(*events)
+    return Encoder().encode(*sort_readout(*joined(list(parts))))
 
 
 def wavy(k: int, column: NDArray[Any]) -> NDArray[np.float64]:
