@@ -40,7 +40,7 @@ import eschorty_ros as es
 from eschorty_ros.core.evt3 import Encoder
 
 t_us, column, event = np.meshgrid(
-    np.arange(20) * 1000 + 100, np.arange(1280), np.arange(12), indexing="ij"
+    np.arange(20) * 1000 + 100, np.arange(400), np.arange(12), indexing="ij"
 )
 row, polarity = 350 + event % 3, np.ones(t_us.size, int)
 data = Encoder().encode(t_us.ravel(), column.ravel(), row.ravel(), polarity)
@@ -74,7 +74,7 @@ content = tuple(np.zeros(3) for _ in range(100))
 
 
 def call():
-    for _ in range(100):
+    for _ in range(25):
         Boxed(content)
 """
 
