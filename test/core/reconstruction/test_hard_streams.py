@@ -27,6 +27,7 @@ from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import World, simulate_recording
 
 MODEL = CALIBRATION.model()
+TILTED = named("tilted", MODEL)
 
 
 def points(camera: Camera, *parts: Events, **settings) -> tuple[Profiles, Reconstructor]:
@@ -332,30 +333,14 @@ def test_columns_of_a_line_without_enough_events_among_background_have_a_reason(
 
 @pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
 def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
-    narrow = replace(CALIBRATION, columns=160, principal_column=None)
+    narrow = replace(CALIBRATION, columns=80, principal_column=None)
     sweep = (10.0, 16.0, 300.0)
     recording = simulate_recording(tmp_path, Plane(), narrow, Modulation(frequency_hz), *sweep, 1)
     found = reconstruct_recording(recording).profiles
-    assert len(found) > 0.98 * found.profile_count * 160, "seed 1"
+    assert len(found) > 0.98 * found.profile_count * 80, "seed 1"
     stage_mm = recording.stage.position_mm(found.t_us)
     error_mm = found.range_mm - true_range_mm(Plane(), narrow.model(), stage_mm, found.column)
     assert np.median(np.abs(error_mm)) < 0.4, "seed 1"
-
-
-@pytest.fixture(scope="module")
-def swept_face(tmp_path_factory):
-    """Errors in mm of the points of a face that is swept fast, with these settings."""
-    narrow = replace(CALIBRATION, columns=320, principal_column=None)
-    scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
-    folder = tmp_path_factory.mktemp("face")
-    recording = simulate_recording(folder, scene, narrow, Modulation(70.0), *sweep)
-
-    def reconstructed(**settings):
-        found = reconstruct_recording(recording, Settings(**settings)).profiles
-        stage_mm = recording.stage.position_mm(found.t_us)
-        return found.range_mm - true_range_mm(scene, narrow.model(), stage_mm, found.column)
-
-    return reconstructed
 
 
 @dataclass(frozen=True)
@@ -384,12 +369,18 @@ def test_good_points_of_a_surface_that_slopes_have_no_flag(scene, stop_mm, speed
     assert np.mean(found.flags[np.abs(error_mm) < 1.0] != 0) < 0.01, "seed 0"
 
 
-def test_a_learned_footprint_does_not_pull_lines_that_move_while_they_are_lit(swept_face):
-    p95_mm = {
-        method: np.nanquantile(np.abs(swept_face(centroid=method)), 0.95)
-        for method in ("mode_mean", "learned")
-    }
-    assert p95_mm["learned"] < 1.2 * p95_mm["mode_mean"]
+def test_a_learned_footprint_does_not_pull_lines_that_move_while_they_are_lit(tmp_path):
+    narrow = replace(CALIBRATION, columns=320, principal_column=None)
+    scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
+    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep)
+    p95_mm = []
+    for method in ("mode_mean", "learned"):
+        found = reconstruct_recording(recording, Settings(centroid=method)).profiles
+        stage_mm = recording.stage.position_mm(found.t_us)
+        truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
+        p95_mm.append(np.nanquantile(np.abs(found.range_mm - truth_mm), 0.95))
+    print(p95_mm)
+    assert p95_mm[1] < 1.2 * p95_mm[0], "seed 0"
 
 
 @dataclass(frozen=True)
@@ -844,15 +835,18 @@ def test_a_line_that_moves_at_1_khz_is_no_fault_of_the_readout(tmp_path):
     assert reconstruct_recording(recording).warnings == (), "seed 1"
 
 
+@pytest.fixture(scope="module")
+def swept_plane(tmp_path_factory):
+    folder, sweep = tmp_path_factory.mktemp("tilted"), (10.0, 100.0, 300.0)
+    return simulate_recording(folder, TILTED, CALIBRATION, Modulation(70.0), *sweep, 1)
+
+
 @pytest.mark.parametrize(("polarity", "others"), [(0, 0), (1, 0), (1, 150)])
 def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger_sigma(
-    polarity, others, tmp_path
+    polarity, others, swept_plane
 ):
     """Background, one in so many of the ``others``, has both."""
-    scene = named("tilted", MODEL)
-    recording = simulate_recording(
-        tmp_path, scene, CALIBRATION, Modulation(70.0), 10.0, 100.0, 300.0, 1
-    )
+    recording = swept_plane
     events = Decoder().decode(b"".join(RawReader(recording.events_path).mapped(1 << 20)))
     kept = events.p == polarity
     if others:
@@ -860,7 +854,7 @@ def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger
     one = (values[kept] for values in (events.t, events.x, events.y, events.p))
     found, reconstructor = reconstruct(stream(tuple(one)), recording.modulation, Settings())
     stage_mm = recording.stage.position_mm(found.t_us)
-    truth_mm = true_range_mm(scene, MODEL, stage_mm, found.column)
+    truth_mm = true_range_mm(TILTED, MODEL, stage_mm, found.column)
     error_px = np.abs(found.row - MODEL.row(truth_mm, found.column))
     assert np.nanmean(error_px < 2.0 * found.sigma_row) > 0.8, "seed 1"
     (warning,) = reconstructor.warnings
