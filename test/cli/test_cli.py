@@ -569,6 +569,7 @@ end_header
 """
 
 
+@pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize(("name", "text"), [("other.pcd", PCD), ("other.ply", PLY)])
 def test_view_draws_the_clouds_of_other_programs(tmp_path, name, text):
     (tmp_path / name).write_text(text)
