@@ -105,7 +105,7 @@ NODES := test/launch test/nodes
 REST := test $(addprefix --ignore=,$(PURE) $(DEVICES) $(SCANS) $(NODES))
 # Threads of libraries that wait for each other by spinning take five times as long beside other work.
 test-pure test-devices test-scans test-nodes test-rest quick: export OMP_NUM_THREADS := 1
-# Freed arrays stay with the process: the kernel clears what it gives out again, a seventh of the time.
+# Freed arrays stay with the process: to clear what the system gives out again is a tenth of the time.
 test-pure quick: export MALLOC_MMAP_THRESHOLD_ := 4294967296
 test-pure quick: export MALLOC_TRIM_THRESHOLD_ := 4294967296
 test-%: run = pytest $(tests) -o cache_dir=$(BUILD)/$@

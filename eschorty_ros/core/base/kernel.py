@@ -206,7 +206,7 @@ def _digest(function: Callable[..., Any]) -> str:
 
 def _names(code: CodeType) -> Iterator[str]:
     """Yield the names of all globals that the code reads."""
-    # dis.get_instructions costs each process that imports kernels 0.1 s.
+    # dis.get_instructions would take a tenth of the start of a process that imports kernels.
     argument = 0
     for operation, low_bits in zip(code.co_code[::2], code.co_code[1::2], strict=True):
         argument = argument << 8 | low_bits

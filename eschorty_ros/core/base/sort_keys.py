@@ -15,8 +15,8 @@ _DIGITS = 1 << _DIGIT_BITS
 def sort_keys(keys: NDArray[np.int64]) -> None:
     """Sort integers that are not negative, in place.
 
-    The same as ``keys.sort()``, which takes 5 to 13 times as long where numpy has AVX-512 on a
-    processor that emulates part of it (AMD Zen 4).
+    The same as ``keys.sort()``, which takes four to five times as long where numpy uses AVX-512 on
+    a processor that emulates part of it (AMD Zen 4).
     """
     _sort(keys, np.empty_like(keys))
 

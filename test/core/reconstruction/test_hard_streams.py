@@ -846,14 +846,13 @@ def test_events_of_one_polarity_of_a_line_that_moves_have_a_warning_and_a_larger
     polarity, others, swept_plane
 ):
     """Background, one in so many of the ``others``, has both."""
-    recording = swept_plane
-    events = Decoder().decode(b"".join(RawReader(recording.events_path).mapped(1 << 20)))
+    events = Decoder().decode(b"".join(RawReader(swept_plane.events_path).mapped(1 << 20)))
     kept = events.p == polarity
     if others:
         kept[::others] = True
     one = (values[kept] for values in (events.t, events.x, events.y, events.p))
-    found, reconstructor = reconstruct(stream(tuple(one)), recording.modulation, Settings())
-    stage_mm = recording.stage.position_mm(found.t_us)
+    found, reconstructor = reconstruct(stream(tuple(one)), swept_plane.modulation, Settings())
+    stage_mm = swept_plane.stage.position_mm(found.t_us)
     truth_mm = true_range_mm(TILTED, MODEL, stage_mm, found.column)
     error_px = np.abs(found.row - MODEL.row(truth_mm, found.column))
     assert np.nanmean(error_px < 2.0 * found.sigma_row) > 0.8, "seed 1"
