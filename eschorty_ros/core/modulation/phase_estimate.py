@@ -72,7 +72,9 @@ def estimate_phase(
     phase -= np.floor(phase)
     if weights is None:
         weights = np.ones(t_us.size)
-    vector = abs(weights @ np.exp(2j * np.pi * phase))
+    angle = 2.0 * np.pi * phase
+    # A complex exponential would take half as long again.
+    vector = math.hypot(weights @ np.cos(angle), weights @ np.sin(angle))
     strength = min(float(vector / max(weights.sum(), 1.0)), 1.0)
     found = bool(vector * vector > _RAYLEIGH_MIN * (weights @ weights))
     gap_bins = min(math.ceil(_ROW_US * _HISTOGRAM_BINS / period_us), _GAP_BINS_MAX)
