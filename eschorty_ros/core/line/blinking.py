@@ -27,7 +27,6 @@ from eschorty_ros.core.line.window import (
     TIME_SHIFT,
     _chernoff_exponent,
     _column,
-    _pad,
 )
 from eschorty_ros.core.modulation import Modulation
 
@@ -270,7 +269,8 @@ def _without(column, first, last):
         if not first <= row <= last:
             column.packed[column.start + n] = column.packed[i]
             n += 1
-    _pad(column.packed, column.start + n)
+    for i in range(column.start + n, column.start + column.events):
+        column.packed[i] = PAD
     return _column(column.packed, column.start, n, column.lit_us)
 
 
