@@ -27,6 +27,7 @@ from eschorty_ros.core.line.window import (
     TIME_SHIFT,
     _chernoff_exponent,
     _column,
+    _padded_end,
 )
 from eschorty_ros.core.modulation import Modulation
 
@@ -201,9 +202,8 @@ def _add_lines(columns, half, place, blink):
         seed = columns.seeds[c]
         if blink.step == 0 or seed < 0:
             continue
-        start, events = columns.starts[c], np.int64(0)
-        while columns.packed[np.uintp(start + events)] != PAD:
-            events += 1
+        start = columns.starts[c]
+        events = np.int64(_padded_end(columns.packed, start)) - start
         column = _column(columns.packed, start, events, blink.lit_us)
         first = max((seed - half) // FRACTION, 0)
         vector = _vector(column, first, (seed + half) // FRACTION, blink)

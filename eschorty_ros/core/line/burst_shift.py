@@ -23,12 +23,11 @@ from eschorty_ros.core.line.line_history import RECENT_PROFILES, _has_one_polari
 from eschorty_ros.core.line.window import (
     _ONE,
     _ONE_BITS,
-    BLOCK,
     FRACTION,
-    PAD,
     POLARITY,
     ROW_MASK,
     TIME_SHIFT,
+    _padded_end,
 )
 
 # Share of the sums that the next profile keeps.
@@ -38,6 +37,8 @@ _BURST = 1 << 30
 # Where late events begin, at first, and the share of its value by which an event moves that.
 _LATE = 1 << 26
 _STEP = 1.0 / 32.0
+# Events of a column that move it together.
+_STEP_EVENTS = np.uintp(32)
 # Share of the events of a burst that are early.
 _EARLY_SHARE = 0.75
 # Difference of both parts over the standard deviation by which whole pixels move the mean row.
@@ -107,11 +108,12 @@ def _add_column(packed, start, seed, half, blink, block, bursts):
     base, span = np.uint32(first), np.uint32((seed + half) // FRACTION - first)
     late_on, late_off = np.uint32(bursts.late[block, 1]), np.uint32(bursts.late[block, 0])
     none = np.uint32(0)
-    begin = np.uintp(start)
-    while packed[begin] != PAD:
-        # A block's number of events and the sum of their rows share a register.
+    begin, padded = np.uintp(start), _padded_end(packed, start)
+    while begin < padded:
+        # The number of some events and the sum of their rows share a register.
         on_early, on_late, off_early, off_late = none, none, none, none
-        for i in range(begin, begin + np.uintp(BLOCK)):
+        end = min(begin + _STEP_EVENTS, padded)
+        for i in range(begin, end):
             v = packed[i]
             d = np.uint32((v & ROW_MASK) - base)
             on = (v & POLARITY) > 0
@@ -125,7 +127,7 @@ def _add_column(packed, start, seed, half, blink, block, bursts):
             off_late = np.uint32(off_late + (value if (not on) & late else none))
         _add_sums(bursts, block, 1, on_early, on_late, first - seed / FRACTION)
         _add_sums(bursts, block, 0, off_early, off_late, first - seed / FRACTION)
-        begin += np.uintp(BLOCK)
+        begin = end
 
 
 @kernel(_nrt=False)

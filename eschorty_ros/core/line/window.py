@@ -26,7 +26,7 @@ _POLARITY_SHIFT = np.uint32(ROW_BITS)
 TIME_SHIFT = np.uint32(ROW_BITS + 1)
 TIME_LIMIT_US = 1 << (31 - ROW_BITS)
 PAD = np.uint32(0xFFFFFFFF)
-BLOCK = 32
+BLOCK = 16
 FRACTION_BITS = 6
 FRACTION = 1 << FRACTION_BITS
 HALF_WIDTH_PER_FWHM = 1.3
@@ -105,6 +105,15 @@ def _pad(packed, end):
     """Fill a block after a column's events."""
     for i in range(np.uintp(BLOCK)):
         packed[np.uintp(end) + i] = PAD
+
+
+@kernel(_nrt=False)
+def _padded_end(packed, start):
+    """Return the end of the blocks of a column's events, which begin at ``start``."""
+    end = np.uintp(start)
+    while packed[end] != PAD:
+        end += np.uintp(BLOCK)
+    return end
 
 
 # In line, as kernels that count references to arrays call it, and others that do not.
