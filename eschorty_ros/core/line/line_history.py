@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blocks import BLOCK_COLUMNS, _near_sum
-from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
+from eschorty_ros.core.line.window import POLARITY, ROW_LAST, ROW_MASK, _limits, _padded_end
 
 # Larger differences from profile to profile are those of another surface, unless all columns have
 # them.
@@ -139,18 +139,17 @@ def _polarity_row(packed, start, seed, half):
 
     NaN where one of the two is missing within ``half`` of the ``seed``.
     """
-    none = np.int64(0)
+    first, last = _limits(seed, half, 0, ROW_LAST)
+    base, span, none = np.uint32(first), np.uint32(last - first), np.uint32(0)
     on, off, on_rows, off_rows = none, none, none, none
-    i = np.uintp(start)
-    while packed[i] != PAD:
-        row = np.int64(packed[i] & ROW_MASK)
-        inside = abs((row << FRACTION_BITS) - seed) <= half
+    for i in range(np.uintp(start), _padded_end(packed, start)):
+        row = packed[i] & ROW_MASK
+        inside = np.uint32(row - base) <= span
         is_on = (packed[i] & POLARITY) > 0
-        on += inside & is_on
-        on_rows += row if inside & is_on else none
-        off += inside & (not is_on)
-        off_rows += row if inside & (not is_on) else none
-        i += np.uintp(1)
+        on = np.uint32(on + np.uint32(inside & is_on))
+        on_rows = np.uint32(on_rows + (row if inside & is_on else none))
+        off = np.uint32(off + np.uint32(inside & (not is_on)))
+        off_rows = np.uint32(off_rows + (row if inside & (not is_on) else none))
     if min(on, off) == 0:
         return np.nan
     return (on_rows + off_rows) / (on + off) - 0.5 * (on_rows / on + off_rows / off)
