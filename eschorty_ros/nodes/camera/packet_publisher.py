@@ -39,7 +39,7 @@ class PacketPublisher:
         self.off = 0
         self._decoder = Decoder()
         # Kernels are loaded now, not while events wait.
-        Decoder().decode(bytes(2))
+        self._decoder.decode(b"")
         self._publisher = publisher
         self._width = self._height = 0
         self._frame_id = frame_id
