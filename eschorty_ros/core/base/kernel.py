@@ -23,7 +23,6 @@ import numpy as np
 from llvmlite import ir
 from llvmlite.binding import parse_assembly
 from numba import njit, types
-from numba.core.caching import IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
@@ -34,22 +33,12 @@ from numpy.typing import NDArray
 def entry_kernel(*arguments: Any, **options: Any) -> Any:
     """Compile a function that Python calls: cached, without the GIL, division as numpy divides.
 
-    It is compiled at the first call: with ``@entry_kernel`` for the types of the arguments, with
-    ``@entry_kernel(signature)`` for that signature only. Keyword options are those of
-    ``numba.njit``.
+    ``@entry_kernel`` compiles at the first call, ``@entry_kernel(signature, ...)`` at import and
+    for these signatures only. Keyword options are those of ``numba.njit``.
     """
     if len(arguments) == 1 and hasattr(arguments[0], "__code__"):
-        return _compiled(_Entry, arguments[0], options)
-    if not arguments:
-        return lambda function: _compiled(_Entry, function, options)
-    (signature,) = arguments
-
-    def decorated(function: Callable[..., Any]) -> Any:
-        dispatcher = _compiled(_EntryOfSignature, function, options)
-        dispatcher.signature = signature
-        return dispatcher
-
-    return decorated
+        return _compiled(_Entry, arguments[0], (), options)
+    return lambda function: _compiled(_Entry, function, arguments, options)
 
 
 def kernel(*function: Any, **options: Any) -> Any:
@@ -74,7 +63,7 @@ def kernel(*function: Any, **options: Any) -> Any:
         "pipeline_class": _InnerCompiler,
         **options,
     }
-    return _compiled(_Inner, function[0], options)
+    return _compiled(_Inner, function[0], (), options)
 
 
 class _Kernel(CPUDispatcher):
@@ -97,22 +86,6 @@ class _Entry(_Kernel):
             name = self.py_func.__qualname__
             raise TypeError(f"{name} returns a named tuple; return a plain one")
         return compiled
-
-
-class _EntryOfSignature(_Entry):
-    """An entry kernel of one signature, until it is called.
-
-    To load a kernel's code at import would make every command wait that shows its help.
-    """
-
-    signature: Any
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Compile the signature and call it; from now on numba's faster call does."""
-        self.compile(self.signature)
-        self.disable_compile()
-        self.__class__ = _Entry
-        return self(*arguments)
 
 
 @contextmanager
@@ -189,27 +162,27 @@ class _InnerLibrary(JITCodeLibrary):
         return self.serialize_using_bitcode()
 
 
-def _compiled(kind: type[CPUDispatcher], function: Callable[..., Any], options: Any) -> Any:
+def _compiled(
+    kind: type[CPUDispatcher],
+    function: Callable[..., Any],
+    signatures: tuple[Any, ...],
+    options: Any,
+) -> Any:
     dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     dispatcher.__class__ = kind
     # numba has no public way to say what a cached function depends on.
     index = dispatcher._cache._cache_file
     index._source_stamp = dispatcher.source_digest = _digest(function)
-    index.__class__ = _Index
+    try:
+        index._load_index()
+    except Exception:
+        # The cache names a type that only an earlier version had.
+        index.flush()
+    for signature in signatures:
+        dispatcher.compile(signature)
+    if signatures:
+        dispatcher.disable_compile()
     return dispatcher
-
-
-class _Index(IndexDataCacheFile):
-    """The list of what a kernel's cache holds; empty where only an earlier version can read it."""
-
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            entries: dict[Any, str] = super()._load_index()
-        except Exception:
-            # It names a type that is no more.
-            self.flush()
-            return {}
-        return entries
 
 
 def _digest(function: Callable[..., Any]) -> str:

@@ -38,8 +38,6 @@ class PacketPublisher:
         self.on = 0
         self.off = 0
         self._decoder = Decoder()
-        # Kernels are loaded now, not while events wait.
-        self._decoder.decode(b"")
         self._publisher = publisher
         self._width = self._height = 0
         self._frame_id = frame_id
