@@ -203,8 +203,8 @@ def _add_lines(columns, half, place, blink):
         if blink.step == 0 or seed < 0:
             continue
         start = columns.starts[c]
-        events = np.int64(_padded_end(columns.packed, start)) - start
-        column = _column(columns.packed, start, events, blink.lit_us)
+        padded = np.int64(_padded_end(columns.packed, start)) - start
+        column = _column(columns.packed, start, padded, blink.lit_us)
         first = max((seed - half) // FRACTION, 0)
         vector = _vector(column, first, (seed + half) // FRACTION, blink)
         length = np.sqrt(float(vector.x * vector.x + vector.y * vector.y))

@@ -73,7 +73,7 @@ def estimate_phase(
     if weights is None:
         weights = np.ones(t_us.size)
     angle = 2.0 * np.pi * phase
-    # A complex exponential would take half as long again.
+    # Faster than a complex exponential.
     vector = math.hypot(weights @ np.cos(angle), weights @ np.sin(angle))
     strength = min(float(vector / max(weights.sum(), 1.0)), 1.0)
     found = bool(vector * vector > _RAYLEIGH_MIN * (weights @ weights))
