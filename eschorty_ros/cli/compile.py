@@ -23,6 +23,7 @@ def command() -> None:
     begun_s = time.monotonic()
     with progress_bar("compiling") as report:
         report(0.0, "reconstruction")
+        import eschorty_ros.core.calibration  # noqa: F401 - its kernels, too
         from eschorty_ros.core.optics import load_calibration
         from eschorty_ros.core.reconstruction import warm_up
 

@@ -23,6 +23,7 @@ import numpy as np
 from llvmlite import ir
 from llvmlite.binding import parse_assembly
 from numba import njit, types
+from numba.core.caching import IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
@@ -33,12 +34,23 @@ from numpy.typing import NDArray
 def entry_kernel(*arguments: Any, **options: Any) -> Any:
     """Compile a function that Python calls: cached, without the GIL, division as numpy divides.
 
-    ``@entry_kernel`` compiles at the first call, ``@entry_kernel(signature, ...)`` at import and
-    for these signatures only. Keyword options are those of ``numba.njit``.
+    It is compiled at the first call: with ``@entry_kernel`` for the types of the arguments, with
+    ``@entry_kernel(signature)`` for that signature only. Keyword options are those of
+    ``numba.njit``.
     """
     if len(arguments) == 1 and hasattr(arguments[0], "__code__"):
-        return _compiled(_Entry, arguments[0], (), options)
-    return lambda function: _compiled(_Entry, function, arguments, options)
+        return _compiled(_Entry, arguments[0], options)
+    if not arguments:
+        return lambda function: _compiled(_Entry, function, options)
+    (signature,) = arguments
+
+    def decorated(function: Callable[..., Any]) -> Any:
+        dispatcher = _compiled(_EntryOfSignature, function, options)
+        dispatcher.signature = signature
+        _not_loaded.append(dispatcher)
+        return dispatcher
+
+    return decorated
 
 
 def kernel(*function: Any, **options: Any) -> Any:
@@ -63,7 +75,7 @@ def kernel(*function: Any, **options: Any) -> Any:
         "pipeline_class": _InnerCompiler,
         **options,
     }
-    return _compiled(_Inner, function[0], (), options)
+    return _compiled(_Inner, function[0], options)
 
 
 class _Kernel(CPUDispatcher):
@@ -86,6 +98,38 @@ class _Entry(_Kernel):
             name = self.py_func.__qualname__
             raise TypeError(f"{name} returns a named tuple; return a plain one")
         return compiled
+
+
+class _EntryOfSignature(_Entry):
+    """An entry kernel of one signature that is not loaded yet.
+
+    To load it at import would make every command wait that shows its help.
+    """
+
+    signature: Any
+
+    def __call__(self, *arguments: Any) -> Any:
+        _load(self)
+        return self(*arguments)
+
+
+def _load(entry: _EntryOfSignature) -> None:
+    """Load a kernel's code, or compile it; from now on numba's own call is used."""
+    with global_compiler_lock:
+        # Another call or thread may have done so.
+        if type(entry) is _EntryOfSignature:
+            entry.compile(entry.signature)
+            entry.disable_compile()
+            entry.__class__ = _Entry
+
+
+_not_loaded: list[_EntryOfSignature] = []
+
+
+def load_kernels() -> None:
+    """Load, or compile, every imported kernel that has a signature; else its first call does."""
+    while _not_loaded:
+        _load(_not_loaded.pop())
 
 
 @contextmanager
@@ -162,27 +206,26 @@ class _InnerLibrary(JITCodeLibrary):
         return self.serialize_using_bitcode()
 
 
-def _compiled(
-    kind: type[CPUDispatcher],
-    function: Callable[..., Any],
-    signatures: tuple[Any, ...],
-    options: Any,
-) -> Any:
+def _compiled(kind: type[CPUDispatcher], function: Callable[..., Any], options: Any) -> Any:
     dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     dispatcher.__class__ = kind
     # numba has no public way to say what a cached function depends on.
     index = dispatcher._cache._cache_file
     index._source_stamp = dispatcher.source_digest = _digest(function)
-    try:
-        index._load_index()
-    except Exception:
-        # The cache names a type that only an earlier version had.
-        index.flush()
-    for signature in signatures:
-        dispatcher.compile(signature)
-    if signatures:
-        dispatcher.disable_compile()
+    index.__class__ = _Index
     return dispatcher
+
+
+class _Index(IndexDataCacheFile):
+    """The list of what a kernel's cache holds; empty where only an earlier version can read it."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except Exception:
+            # It names a type that is no more.
+            self.flush()
+            return {}
 
 
 def _digest(function: Callable[..., Any]) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from eschorty_ros.core.base.kernel import load_kernels
 from eschorty_ros.core.evt3 import Decoder, Encoder
 from eschorty_ros.core.evt3.cuts import Cut, next_cut, triggers_of
 from eschorty_ros.core.modulation import Modulation
@@ -42,3 +43,4 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     words = decoder.words(data)
     next_cut(words, Cut(0, 0), np.zeros(1, np.int64), 1, False, decoder)
     triggers_of(words, decoder)
+    load_kernels()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from event_camera_msgs.msg import EventPacket
 
+from eschorty_ros.core.base.kernel import load_kernels
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.hardware.base.protocols import EventChunk
 from eschorty_ros.live.packet_cutting import Packetizer
@@ -38,6 +39,8 @@ class PacketPublisher:
         self.on = 0
         self.off = 0
         self._decoder = Decoder()
+        # Now, not while events wait.
+        load_kernels()
         self._publisher = publisher
         self._width = self._height = 0
         self._frame_id = frame_id

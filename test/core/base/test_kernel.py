@@ -218,6 +218,28 @@ print(len(_box().stats.cache_misses))
     assert results[1].stdout == "0\n", results[1].stderr
 
 
+def test_threads_may_share_the_first_call_of_a_kernel(tmp_path):
+    code = """
+from concurrent.futures import ThreadPoolExecutor
+from eschorty_ros.core.base.kernel import entry_kernel, load_kernels
+
+@entry_kernel("int64(int64)")
+def _doubled(x):
+    return 2 * x
+
+print(*ThreadPoolExecutor(4).map(_doubled, range(4)))
+load_kernels()
+"""
+    (tmp_path / "shared.py").write_text(code)
+    assert output(tmp_path, str(tmp_path / "shared.py")) == "0 2 4 6\n"
+
+
+def test_help_compiles_nothing(tmp_path):
+    code = "from eschorty_ros.cli import main; main(['reconstruct', '--help'])"
+    assert "Example" in output(tmp_path, "-c", code)
+    assert not list(tmp_path.rglob("*.nb?"))
+
+
 def test_a_kernel_that_python_calls_returns_no_named_tuple(tmp_path):
     """numba makes one in a way that an interrupt at that moment turns into a crash."""
     code = """
