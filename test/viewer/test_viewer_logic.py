@@ -1,5 +1,6 @@
 """The page's server without a browser: decimation, text, and when a scan may begin."""
 
+import contextlib
 import http.client
 import queue
 import socket
@@ -239,13 +240,14 @@ def test_a_page_is_served_on_an_ipv6_address():
     page.stop()
 
 
+@contextlib.contextmanager
 def connected(page, **options):
     """A client of ``page`` that looks along x, without a browser."""
     url = f"ws://127.0.0.1:{page.server.get_port()}"
     own = Subprotocol(f"viser-v{viser.__version__}")
-    client = connect(url, subprotocols=[own], max_size=None, **options)
-    look_from(client, (0, 0, 0))
-    return client
+    with connect(url, subprotocols=[own], max_size=None, **options) as client:
+        look_from(client, (0, 0, 0))
+        yield client
 
 
 def look_from(client, position):
@@ -258,40 +260,38 @@ def look_from(client, position):
 
 
 def test_the_view_follows_a_cloud_that_grows_until_its_user_changes_it(served):
-    client = connected(served, max_queue=None)
-    wait_until(lambda: served.pages == 1, "the page")
-    [camera] = (page.camera for page in served.server.get_clients().values())
-    distances_m = []
-    for size_m in (0.05, 0.1, 0.2):
-        points = numbered(0, 100)
-        points["x"], points["y"], points["z"] = 1.0, np.linspace(0.0, size_m, 100), 0.0
+    with connected(served, max_queue=None) as client:
+        wait_until(lambda: served.pages == 1, "the page")
+        [camera] = (page.camera for page in served.server.get_clients().values())
+        distances_m = []
+        for size_m in (0.05, 0.1, 0.2):
+            points = numbered(0, 100)
+            points["x"], points["y"], points["z"] = 1.0, np.linspace(0.0, size_m, 100), 0.0
+            served._cloud.add(points)
+            served.show(points_text)
+            distances_m.append(np.linalg.norm(camera.position - [1.0, size_m / 2.0, 0.0]))
+        assert np.all(np.diff(distances_m) > 0.03)
+        own = (0.5, 0.4, 0.3)
+        look_from(client, own)
+        wait_until(lambda: np.allclose(camera.position, own), "the user's view")
+        points["y"] *= 10.0
         served._cloud.add(points)
         served.show(points_text)
-        distances_m.append(np.linalg.norm(camera.position - [1.0, size_m / 2.0, 0.0]))
-    assert np.all(np.diff(distances_m) > 0.03)
-    own = (0.5, 0.4, 0.3)
-    look_from(client, own)
-    wait_until(lambda: np.allclose(camera.position, own), "the user's view")
-    points["y"] *= 10.0
-    served._cloud.add(points)
-    served.show(points_text)
-    assert np.allclose(camera.position, own)
-    client.close()
+        assert np.allclose(camera.position, own)
 
 
 def test_a_page_that_reads_nothing_is_no_open_page(served):
     """A computer that has vanished or stalled keeps no scan going."""
-    reading, stalled = (connected(served, max_queue=length) for length in (None, 1))
-    wait_until(lambda: served.pages == 2, "both pages")
-    end_s = time.monotonic() + 30.0
-    while served.pages > 1:
-        assert time.monotonic() < end_s, "still counted"
-        served._cloud.add(numbered(0, 50_000))
-        served.show(points_text)
-        time.sleep(0.1)
-    assert served.pages == 1
-    stalled.socket.close()
-    reading.close()
+    with connected(served, max_queue=None), connected(served, max_queue=1) as stalled:
+        wait_until(lambda: served.pages == 2, "both pages")
+        end_s = time.monotonic() + 30.0
+        while served.pages > 1:
+            assert time.monotonic() < end_s, "still counted"
+            served._cloud.add(numbered(0, 50_000))
+            served.show(points_text)
+            time.sleep(0.1)
+        assert served.pages == 1
+        stalled.socket.close()
 
 
 def test_no_page_opens_a_way_into_the_internet(served, monkeypatch):
