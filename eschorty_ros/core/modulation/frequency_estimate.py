@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase
 
@@ -22,7 +23,9 @@ _BESIDE_MIN = 4.0
 _TURNS_MAX = 0.25
 _CLOCKS_MAX = 1e-3
 # Fewest turns in the window: the light's switching on and off has power at few.
-_TURNS_MIN = 8.0
+_TURNS_MIN = 8
+# Parts of the window: bursts with the fewest turns are in half of them.
+_PARTS = 2 * _TURNS_MIN
 # Turns over which the power of one frequency falls off.
 _LOBE = 2.0
 # ON events that show the phase, evenly spread.
@@ -95,55 +98,77 @@ class FrequencyEstimate:
         """Return the frequency of the bursts, ``expected_hz`` where the events agree with it.
 
         ``None`` when no frequency stands out. Bursts show multiples of their frequency, too: it is
-        the lowest one that stands out.
+        the lowest one that stands out. A flash of another light, or a jolt, may be one burst of all
+        pixels: where the events do not agree, it is left out.
         """
         used = np.flatnonzero(self._busiest.any(axis=0))
         if used.size < _TURNS_MIN:
             return None
-        span_s = float(used[-1] - used[0] + 1) * _BIN_US * 1e-6
         counts = self._busiest[:, used[0] : used[-1] + 1]
-        length = 1 << int(np.ceil(np.log2(_STEPS * counts.shape[1])))
-        step_hz = 1e6 / (length * _BIN_US)
-        # A window with soft ends keeps a strong light from hiding a weak one.
-        soft = (counts - counts.mean(axis=1, keepdims=True)) * np.hanning(counts.shape[1])
-        spectrum = np.fft.rfft(soft, length, axis=1)
-        power = (np.abs(spectrum) ** 2).sum(axis=0)
-        low = max(round(0.9 * FREQUENCY_MIN_HZ / step_hz), 1)
-        high = round(FREQUENCY_MAX_HZ / step_hz)
-        strongest = float(power[low:high].max())
-        noise = _LINE_MIN * float(np.median(power[low:high]))
-        if strongest <= noise:
-            return None
-        reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
-
-        def highest(from_hz: float, to_hz: float) -> float:
-            near = power[max(int(from_hz / step_hz), 0) : int(to_hz / step_hz) + 2]
-            return float(near.max(initial=0.0))
-
-        def at_line(frequency_hz: float) -> float:
-            return highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
-
-        def stands_out(frequency_hz: float) -> bool:
-            below = highest(frequency_hz - outer_hz, frequency_hz - inner_hz)
-            above = highest(frequency_hz + inner_hz, frequency_hz + outer_hz)
-            return at_line(frequency_hz) >= max(noise, _BESIDE_MIN * max(below, above))
-
-        peak = low + int(np.argmax(power[low:high] >= _STRONG * strongest))
-        while power[peak + 1] > power[peak]:
-            peak += 1
-        before, at, after = np.log(power[peak - 1 : peak + 2])
-        found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * step_hz
-        if found_hz * span_s < _TURNS_MIN:
-            return None
-        apart_hz = abs(expected_hz - found_hz)
-        tolerance_hz = max(reach_hz, _CLOCKS_MAX * expected_hz)
-        if apart_hz <= tolerance_hz:
-            return expected_hz
-        if apart_hz <= inner_hz or not stands_out(expected_hz):
+        found_hz = _frequency_hz(counts, expected_hz)
+        if found_hz in {None, expected_hz}:
             return found_hz
-        # Another light may blink as well: then the multiples between the two are weak.
-        multiple = round(expected_hz / found_hz)
-        of_found = abs(expected_hz - multiple * found_hz) <= multiple * tolerance_hz
-        strong = _STRONG * strongest
-        between = all(at_line(order * found_hz) >= strong for order in range(2, multiple))
-        return found_hz if of_found and between else expected_hz
+        even_hz = _frequency_hz(_without_flash(counts), expected_hz)
+        return found_hz if even_hz is None else even_hz
+
+
+def _without_flash(counts: NDArray[np.int64]) -> Array:
+    """Return the counts of each polarity, of the two busiest parts as many as of the third.
+
+    One burst is in two parts at most.
+    """
+    starts = np.arange(_PARTS) * counts.shape[1] // _PARTS
+    parts = np.maximum(np.add.reduceat(counts, starts, axis=1), 1)
+    most = np.sort(parts, axis=1)[:, -3:-2]
+    lengths = np.diff(starts, append=counts.shape[1])
+    return counts * np.repeat(np.minimum(most / parts, 1.0), lengths, axis=1)
+
+
+def _frequency_hz(counts: Array | NDArray[np.int64], expected_hz: float) -> float | None:
+    """Return the frequency of counts by polarity and step; see `FrequencyEstimate`."""
+    span_s = counts.shape[1] * _BIN_US * 1e-6
+    length = 1 << int(np.ceil(np.log2(_STEPS * counts.shape[1])))
+    step_hz = 1e6 / (length * _BIN_US)
+    # A window with soft ends keeps a strong light from hiding a weak one.
+    soft = (counts - counts.mean(axis=1, keepdims=True)) * np.hanning(counts.shape[1])
+    spectrum = np.fft.rfft(soft, length, axis=1)
+    power = (np.abs(spectrum) ** 2).sum(axis=0)
+    low = max(round(0.9 * FREQUENCY_MIN_HZ / step_hz), 1)
+    high = round(FREQUENCY_MAX_HZ / step_hz)
+    strongest = float(power[low:high].max())
+    noise = _LINE_MIN * float(np.median(power[low:high]))
+    if strongest <= noise:
+        return None
+    reach_hz, inner_hz, outer_hz = (k / span_s for k in (_TURNS_MAX, _LOBE, 1.5 * _LOBE))
+
+    def highest(from_hz: float, to_hz: float) -> float:
+        near = power[max(int(from_hz / step_hz), 0) : int(to_hz / step_hz) + 2]
+        return float(near.max(initial=0.0))
+
+    def at_line(frequency_hz: float) -> float:
+        return highest(frequency_hz - reach_hz, frequency_hz + reach_hz)
+
+    def stands_out(frequency_hz: float) -> bool:
+        below = highest(frequency_hz - outer_hz, frequency_hz - inner_hz)
+        above = highest(frequency_hz + inner_hz, frequency_hz + outer_hz)
+        return at_line(frequency_hz) >= max(noise, _BESIDE_MIN * max(below, above))
+
+    peak = low + int(np.argmax(power[low:high] >= _STRONG * strongest))
+    while power[peak + 1] > power[peak]:
+        peak += 1
+    before, at, after = np.log(power[peak - 1 : peak + 2])
+    found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * step_hz
+    if found_hz * span_s < _TURNS_MIN:
+        return None
+    apart_hz = abs(expected_hz - found_hz)
+    tolerance_hz = max(reach_hz, _CLOCKS_MAX * expected_hz)
+    if apart_hz <= tolerance_hz:
+        return expected_hz
+    if apart_hz <= inner_hz or not stands_out(expected_hz):
+        return found_hz
+    # Another light may blink as well: then the multiples between the two are weak.
+    multiple = round(expected_hz / found_hz)
+    of_found = abs(expected_hz - multiple * found_hz) <= multiple * tolerance_hz
+    strong = _STRONG * strongest
+    between = all(at_line(order * found_hz) >= strong for order in range(2, multiple))
+    return found_hz if of_found and between else expected_hz

@@ -43,6 +43,16 @@ def test_another_light_does_not_hide_the_laser():
     assert shown_hz(70.0, bright) == pytest.approx(100.0, rel=0.01)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("expected_hz", [70.0, 72.0])
+def test_a_flash_does_not_hide_the_laser(expected_hz, seed):
+    """Most pixels of a sensor fire once, within some milliseconds, as a lamp is switched on."""
+    rng = np.random.default_rng(seed)
+    flash = rng.uniform(0.1, 0.8) * 1e6 + rng.uniform(0.0, 3000.0, 800_000)
+    found_hz = shown_hz(expected_hz, bursts(70.0, 0.9, 10_000), flash.astype(np.int64), NOISE)
+    assert found_hz == pytest.approx(70.0, rel=5e-3)
+
+
 def test_events_without_rhythm_show_none():
     assert shown_hz(70.0, NOISE) is None
     assert shown_hz(70.0, np.arange(0, 2_000_000, 10)) is None
