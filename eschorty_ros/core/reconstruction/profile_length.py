@@ -179,10 +179,17 @@ class ProfileLength:
         return phase.edge_us if phase.found or _is_line(*events[1:3]) else None
 
     def _is_everywhere(self, held: HeldEvents, begin: int, end: int) -> bool:
-        """Return whether events of a window follow the laser and are in many rows of a column."""
+        """Return whether events of a window follow the laser and are in many rows of a column.
+
+        Those of its fullest period do not show it: all pixels of a camera that starts fire once.
+        """
+        if begin == end:
+            return False
         events = sample([values[begin:end] for values in held.arrays], _SAMPLE)
-        t_us, columns, rows, polarity = events
-        if begin == end or _is_line(columns, rows):
+        turns = ((events[0] - events[0][0]) / self._modulation.period_us).astype(np.int64)
+        others = turns != np.bincount(turns).argmax()
+        t_us, columns, rows, polarity = (values[others] for values in events)
+        if not t_us.size or _is_line(columns, rows):
             return False
         return estimate_phase(t_us, polarity, self._modulation).strength > STRENGTH_MIN
 

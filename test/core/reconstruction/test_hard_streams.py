@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from independent_pixels import COLUMNS, FIRST_EDGE_US, Camera, Events, stream, wavy
+from independent_pixels import COLUMNS, FIRST_EDGE_US, ROWS, Camera, Events, stream, wavy
 from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime import rtsys
 from reconstructing import CALIBRATION, reconstruct
@@ -647,6 +647,15 @@ def test_events_that_follow_no_laser_have_a_warning_in_more_than_two_periods(per
     expected = CALIBRATION.columns * (camera.periods - periods)
     assert len(found) > 0.9 * expected, f"seed {camera.seed}"
     assert any("do not follow" in line for line in reconstructor.warnings) == warned
+
+
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_pixels_that_all_fire_as_the_camera_starts_have_no_warning(seed):
+    camera, pixels = Camera(periods=12, seed=seed), np.arange(ROWS * COLUMNS)
+    t_us = camera.rng.integers(0, 2000, pixels.size)
+    start = t_us, pixels % COLUMNS, pixels // COLUMNS, np.ones(pixels.size, np.uint8)
+    _, reconstructor = reconstruct(stream(camera.line(wavy), start), Modulation(70.0))
+    assert not reconstructor.warnings
 
 
 def test_a_readout_that_reports_lost_events_has_a_warning():
