@@ -191,8 +191,10 @@ class PhaseLock:
         if self._block_end_us is None or watermark_us <= self._block_end_us:
             return False
         triggered = self.schedule.triggered
+        # The first block may end within a period.
+        whole = self._block_end_us - self._begin_us > self._modulation.period_us
         # Edges that triggers set are not moved, nor those of the block of the first trigger.
-        if self._count >= _EVENTS_MIN and not triggered:
+        if self._count >= _EVENTS_MIN and whole and not triggered:
             t_us, polarity = self._t[: self._count], self._p[: self._count]
             estimate = estimate_phase(t_us, polarity, self._modulation)
             if estimate.found:
