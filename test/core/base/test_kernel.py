@@ -218,7 +218,7 @@ print(len(_box().stats.cache_misses))
     assert results[1].stdout == "0\n", results[1].stderr
 
 
-def test_threads_may_share_the_first_call_of_a_kernel(tmp_path):
+def test_kernels_are_loaded_when_they_are_called_by_several_threads_or_all_at_once(tmp_path):
     code = """
 from concurrent.futures import ThreadPoolExecutor
 from eschorty_ros.core.base.kernel import entry_kernel, load_kernels
@@ -227,11 +227,16 @@ from eschorty_ros.core.base.kernel import entry_kernel, load_kernels
 def _doubled(x):
     return 2 * x
 
-print(*ThreadPoolExecutor(4).map(_doubled, range(4)))
+@entry_kernel("int64(int64)")
+def _tripled(x):
+    return 3 * x
+
+print(*ThreadPoolExecutor(4).map(_doubled, range(4)), len(_tripled.overloads))
 load_kernels()
+print(len(_tripled.overloads))
 """
     (tmp_path / "shared.py").write_text(code)
-    assert output(tmp_path, str(tmp_path / "shared.py")) == "0 2 4 6\n"
+    assert output(tmp_path, str(tmp_path / "shared.py")) == "0 2 4 6 0\n1\n"
 
 
 def test_help_compiles_nothing(tmp_path):
